@@ -1,0 +1,1 @@
+"""Experts: the optimal controllers whose trajectories are demonstrations and references."""

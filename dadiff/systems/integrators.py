@@ -1,0 +1,47 @@
+"""Integrators: the double integrator of the paper's experiments (Section IV-A)."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+
+from dadiff.errors import ConfigError
+from dadiff.systems.linear import LinearSystem
+
+
+def discretise(
+    A: np.ndarray, B: np.ndarray, time_step: float, method: Literal["euler", "zoh"]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Discrete (A, B) of dx/dt = A x + B u by python-control: forward Euler or zero-order hold.
+
+    Args:
+        time_step: in seconds.
+    """
+    import control
+
+    if not time_step > 0:
+        raise ConfigError(f"system: time_step is {time_step}; it must be positive (seconds)")
+    continuous = control.ss(A, B, np.eye(len(A)), np.zeros_like(B))
+    discrete = control.c2d(continuous, time_step, method=method)
+    return discrete.A, discrete.B
+
+
+def double_integrator(
+    axes: int = 2,
+    time_step: float = 0.1,
+    discretisation: Literal["euler", "zoh"] = "euler",
+    process_noise: float = 0.01,
+) -> LinearSystem:
+    """Positions and velocities driven by accelerations: n = 2 axes, m = axes.
+
+    With two axes, forward Euler and a time step of 0.1 s these are the A, B of the paper's Section IV-A.
+
+    Args:
+        axes: number of spatial axes.
+        time_step: in seconds.
+        process_noise: standard deviation of w(t) per state and step.
+    """
+    zero, one = np.zeros((axes, axes)), np.eye(axes)
+    A, B = np.block([[zero, one], [zero, zero]]), np.vstack([zero, one])
+    return LinearSystem(*discretise(A, B, time_step, discretisation), process_noise)
