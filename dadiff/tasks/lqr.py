@@ -1,0 +1,120 @@
+"""The LQR task: steer from x_init towards x_target at least quadratic cost (Section IV-A)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+
+from dadiff.errors import ConfigError
+from dadiff.experts.lqr import AffineFeedback, GaussianLaw, closed_loop_law, optimal_feedback, stationary_feedback
+from dadiff.systems import LinearSystem
+from dadiff.tasks.task import Cases, Demonstrations, Scores
+from dadiff.trajectory.response import along
+
+
+@dataclass(frozen=True)
+class LQR:
+    """x_init ~ U[-a, a]^n, x_target ~ U[-b, b]^n; E = [x_init; x_target].
+
+    Args:
+        horizon: T.
+        state_cost: diagonal of Q, (n,).
+        input_cost: R = input_cost * I.
+        init_range: a, in the units of the state.
+        target_range: b, likewise.
+        expert: `optimal` is the finite-horizon affine optimum, `stationary` the infinite-horizon gain.
+        reference: a test case's reference is the controller's trajectory without process noise (`mean`), or
+            one noisy run of it (`realised`).
+    """
+
+    horizon: int = 30
+    state_cost: Sequence[float] = (10.0, 10.0, 1.0, 1.0)
+    input_cost: float = 1.0
+    init_range: float = 1.0
+    target_range: float = 4.0
+    expert: Literal["optimal", "stationary"] = "optimal"
+    reference: Literal["mean", "realised"] = "mean"
+
+    def __post_init__(self) -> None:
+        if self.horizon < 1:
+            raise ConfigError(f"task: horizon is {self.horizon}; it must be at least 1")
+        if min(self.state_cost) < 0 or self.input_cost <= 0:
+            raise ConfigError(
+                f"task: state_cost is {list(self.state_cost)} and input_cost {self.input_cost}; "
+                "Q must not be negative and R must be positive"
+            )
+        if self.init_range < 0 or self.target_range < 0:
+            raise ConfigError("task: init_range and target_range must not be negative")
+
+    @cached_property
+    def Q(self) -> np.ndarray:
+        """(n, n)."""
+        return np.diag(np.asarray(self.state_cost, dtype=np.float64))
+
+    def R(self, system: LinearSystem) -> np.ndarray:
+        """(m, m)."""
+        return self.input_cost * np.eye(system.input_dim)
+
+    def environment_dim(self, system: LinearSystem) -> int:
+        """2n."""
+        return 2 * system.state_dim
+
+    def feedback(self, system: LinearSystem) -> AffineFeedback:
+        """The expert's controller.
+
+        Raises:
+            ConfigError: if state_cost has another length than the system has states.
+        """
+        if len(self.state_cost) != system.state_dim:
+            raise ConfigError(
+                f"task: state_cost has {len(self.state_cost)} entries, the system {system.state_dim} states; "
+                "give one weight a state"
+            )
+        solve = {"optimal": optimal_feedback, "stationary": stationary_feedback}[self.expert]
+        return solve(system, self.Q, self.R(system), self.horizon)
+
+    def law(self, system: LinearSystem) -> GaussianLaw:
+        """The Gaussian law of demonstrations given E."""
+        return closed_loop_law(system, self.feedback(system))
+
+    def sample_environments(self, system: LinearSystem, shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
+        """E of shape (*shape, 2n)."""
+        ranges = np.repeat([self.init_range, self.target_range], system.state_dim)
+        return rng.uniform(-ranges, ranges, size=(*shape, 2 * system.state_dim))
+
+    def demonstrations(self, system: LinearSystem, count: int, rng: np.random.Generator) -> Demonstrations:
+        """`count` noisy runs of the expert, each in an environment of its own."""
+        environment = self.sample_environments(system, (count,), rng)
+        return Demonstrations(self._realise(system, environment, rng), environment)
+
+    def cases(self, system: LinearSystem, count: int, rng: np.random.Generator) -> Cases:
+        """`count` cases for each robot of the system."""
+        environment = self.sample_environments(system, (*system.robots, count), rng)
+        if self.reference == "realised":
+            reference = self._realise(system, environment, rng)
+        else:
+            reference = along(self.law(system).mean_map, environment)
+        return Cases(environment, environment[..., : system.state_dim], reference)
+
+    def _realise(self, system: LinearSystem, environment: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        law = self.law(system)
+        noise = rng.standard_normal((*environment.shape[:-1], law.noise_map.shape[-1]))
+        return along(law.mean_map, environment) + along(law.noise_map, noise)
+
+    def cost(self, system: LinearSystem, tau: np.ndarray, target: np.ndarray) -> np.ndarray:
+        """sum_t |x(t) - x_target|_Q^2 + |u(t)|_R^2 of trajectories (..., d) and targets (..., n)."""
+        states, inputs = system.layout(self.horizon).split(tau)
+        deviation = states[..., :-1, :] - target[..., None, :]
+        return (deviation**2 @ np.diag(self.Q)).sum(-1) + self.input_cost * (inputs**2).sum((-2, -1))
+
+    def score(self, system: LinearSystem, cases: Cases, planned: np.ndarray, rollout: np.ndarray) -> Scores:
+        """The cost after replay, relative to the noise-free finite-horizon optimum of the case."""
+        target = cases.environment[..., system.state_dim :]
+        optimum = along(closed_loop_law(system, optimal_feedback(system, self.Q, self.R(system), self.horizon)).mean_map,
+                        cases.environment)
+        ratio = self.cost(system, rollout, target[..., None, :]) / self.cost(system, optimum, target)[..., None]
+        return Scores(per_plan={"cost_ratio": ratio})

@@ -1,0 +1,81 @@
+"""What a task is: it draws environments E, has its expert solve them, and scores plans.
+
+Tasks know no projector and no network. Arrays are numpy float64. Where several robots are concerned
+their dimension comes first, written `*robots`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+
+from dadiff.systems import LinearSystem
+
+
+@dataclass(frozen=True)
+class Demonstrations:
+    """Expert trajectories, and the environments that they solve.
+
+    Args:
+        trajectories: tau_0, (N, d), physical units.
+        environment: E, (N, c).
+        notes: what a reader should know of the set, by name (counts, shares), reported with it.
+    """
+
+    trajectories: np.ndarray
+    environment: np.ndarray
+    notes: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Cases:
+    """Test cases with the reference that plans are held against.
+
+    Args:
+        environment: E, (*robots, cases, c).
+        x_init: (*robots, cases, n).
+        reference: the optimum's tau, (*robots, cases, d).
+        notes: as for `Demonstrations`.
+    """
+
+    environment: np.ndarray
+    x_init: np.ndarray
+    reference: np.ndarray
+    notes: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Scores:
+    """What a task alone can say of plans; what every task shares is in `dadiff.evaluation`.
+
+    Args:
+        per_plan: name -> (*robots, cases, samples).
+        per_step: name -> (*robots, cases, samples, T+1); nan where a quantity is not defined at T.
+    """
+
+    per_plan: dict[str, np.ndarray] = field(default_factory=dict)
+    per_step: dict[str, np.ndarray] = field(default_factory=dict)
+
+
+class Task(Protocol):
+    """One planning problem. Implementations are dataclasses with a yaml in `conf/task/`."""
+
+    horizon: int
+
+    def environment_dim(self, system: LinearSystem) -> int:
+        """c, the length of the condition vector E."""
+        ...
+
+    def demonstrations(self, system: LinearSystem, count: int, rng: np.random.Generator) -> Demonstrations:
+        """`count` expert demonstrations in fresh environments."""
+        ...
+
+    def cases(self, system: LinearSystem, count: int, rng: np.random.Generator) -> Cases:
+        """`count` test cases with references in fresh environments."""
+        ...
+
+    def score(self, system: LinearSystem, cases: Cases, planned: np.ndarray, rollout: np.ndarray) -> Scores:
+        """Scores of plans (*robots, cases, samples, d), as planned and after replaying their inputs."""
+        ...
