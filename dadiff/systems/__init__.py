@@ -2,5 +2,6 @@
 
 from dadiff.systems.integrators import double_integrator
 from dadiff.systems.linear import LinearSystem
+from dadiff.systems.recording import GaussianExcitation, Recording
 
-__all__ = ["LinearSystem", "double_integrator"]
+__all__ = ["GaussianExcitation", "LinearSystem", "Recording", "double_integrator"]

@@ -1,0 +1,208 @@
+"""Samplers: from noise tau_L to a plan tau_0 (Algorithms 1 and 2).
+
+A sampler says with which weights a step combines the clean estimate, the sample and fresh noise; one loop runs them
+all. With the clean estimate the reverse mean is finite everywhere, also where alpha_bar_L = 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import prod, sqrt
+from typing import Literal, Protocol
+
+import torch
+
+from dadiff.diffusion.enforcement import Enforcement, Project
+from dadiff.diffusion.schedule import Schedule
+from dadiff.errors import ConfigError
+
+Tensor = torch.Tensor
+Denoise = Callable[[Tensor, int, Tensor], Tensor]
+Observe = Callable[[int, Literal["predict", "project"], Tensor], None]
+
+
+@dataclass(frozen=True)
+class Step:
+    """tau_j = clean * tau0_hat + sample * tau_i + noise * eps, from step i down to step j < i.
+
+    Args:
+        call: False where the clean estimate's weight is negligible and the network is not called.
+    """
+
+    i: int
+    j: int
+    clean: float
+    sample: float
+    noise: float
+    call: bool = True
+
+
+class Sampler(Protocol):
+    """The steps from L to 0."""
+
+    def steps(self, schedule: Schedule) -> list[Step]: ...
+
+
+@dataclass(frozen=True)
+class DDPM:
+    """Ancestral sampling, the paper's: tau_{i-1} = mu_q(tau_i, tau0_hat) + sigma_i eps.
+
+        mu_q = sqrt(alpha_bar_{i-1}) beta_i / (1 - alpha_bar_i) tau0_hat
+             + sqrt(alpha_i) (1 - alpha_bar_{i-1}) / (1 - alpha_bar_i) tau_i
+
+    Args:
+        last_step_noise: as in Algorithm 1, which adds sqrt(beta_1) eps to the final plan too.
+        variance: sigma_i^2 is beta_i (the paper's) or the posterior's beta_i (1 - alpha_bar_{i-1}) / (1 - alpha_bar_i).
+        skip_below: bound on the total weight of the clean estimates that are not computed: the sample at the first
+            call differs by at most skip_below * max |tau0_hat|. 0 calls the network at every step.
+    """
+
+    last_step_noise: bool = True
+    variance: Literal["beta", "posterior"] = "beta"
+    skip_below: float = 3e-4
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.skip_below < 1:
+            raise ConfigError(f"sampler: skip_below is {self.skip_below}; it is a weight in [0, 1)")
+
+    def steps(self, schedule: Schedule) -> list[Step]:
+        """L steps, one for each i = L..1."""
+        steps = [self._step(schedule, i) for i in range(schedule.num_steps, 0, -1)]
+        return _skip(steps, self.skip_below)
+
+    def _step(self, schedule: Schedule, i: int) -> Step:
+        beta, alpha, alpha_bar, previous = (
+            schedule.beta[i], schedule.alpha[i], schedule.alpha_bar[i], schedule.alpha_bar[i - 1]
+        )
+        clean = sqrt(previous) * beta / (1 - alpha_bar)
+        sample = sqrt(alpha) * (1 - previous) / (1 - alpha_bar)
+        variance = beta if self.variance == "beta" else beta * (1 - previous) / (1 - alpha_bar)
+        noise = sqrt(variance) if i > 1 or self.last_step_noise else 0.0
+        return Step(i, i - 1, clean, sample, noise)
+
+
+@dataclass(frozen=True)
+class DDIM:
+    """Song, Meng & Ermon (2021): from step i to any j < i, deterministic for eta = 0.
+
+    sigma^2 = eta^2 (1 - alpha_bar_j) / (1 - alpha_bar_i) (1 - alpha_bar_i / alpha_bar_j)
+
+    Args:
+        num_steps: how many of the L steps are visited, evenly spaced.
+        eta: 0 is deterministic; 1 with all steps is `DDPM` with the posterior's variance.
+    """
+
+    num_steps: int = 50
+    eta: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.num_steps < 1 or not 0 <= self.eta <= 1:
+            raise ConfigError(f"sampler: num_steps is {self.num_steps} and eta {self.eta}; need >= 1 and in [0, 1]")
+
+    def steps(self, schedule: Schedule) -> list[Step]:
+        """min(num_steps, L) steps."""
+        L = schedule.num_steps
+        count = min(self.num_steps, L)
+        visited = [round(L * k / count) for k in range(count, -1, -1)]
+        return [self._step(schedule, i, j) for i, j in zip(visited, visited[1:], strict=False)]
+
+    def _step(self, schedule: Schedule, i: int, j: int) -> Step:
+        alpha_bar, next_bar = schedule.alpha_bar[i], schedule.alpha_bar[j]
+        between = prod(schedule.alpha[j + 1 : i + 1])  # alpha_bar_i / alpha_bar_j, where both may underflow
+        variance = self.eta**2 * (1 - next_bar) / (1 - alpha_bar) * (1 - between)
+        sample = sqrt(max(1 - next_bar - variance, 0)) / sqrt(1 - alpha_bar)
+        return Step(i, j, sqrt(next_bar) - sample * sqrt(alpha_bar), sample, sqrt(variance))
+
+
+def _skip(steps: list[Step], bound: float) -> list[Step]:
+    """Mark the leading steps whose clean estimates enter the sample with a total weight of at most `bound`.
+
+    After steps 1..k that weight is W_k = sample_k W_{k-1} + clean_k.
+    """
+    marked, weight = [], 0.0
+    for step in steps:
+        weight = step.sample * weight + step.clean
+        if weight > bound:
+            return marked + steps[len(marked) :]
+        marked.append(Step(step.i, step.j, step.clean, step.sample, step.noise, call=False))
+    raise ConfigError(f"sampler: skip_below = {bound:g} would skip every network call; lower it")
+
+
+def skipped_weight(steps: list[Step]) -> float:
+    """The total weight W of skipped clean estimates: the first called step's sample is off by at most W max |tau0_hat|."""
+    weight = 0.0
+    for step in steps:
+        if step.call:
+            return weight
+        weight = step.sample * weight + step.clean
+    return weight
+
+
+@dataclass(frozen=True)
+class Samples:
+    """What a run of the chain gives.
+
+    Args:
+        tau: plans (*robots, ..., d) in the sampler's coordinates.
+        network_calls: how often the denoiser was called.
+        diverged_at: the step at which a value left the bound or float range, or None.
+    """
+
+    tau: Tensor
+    network_calls: int
+    diverged_at: int | None = None
+
+
+@torch.inference_mode()
+def sample(
+    sampler: Sampler,
+    schedule: Schedule,
+    denoise: Denoise,
+    environment: Tensor,
+    shape: tuple[int, ...],
+    generator: torch.Generator,
+    project: Project | None = None,
+    enforcement: Enforcement | None = None,
+    observe: Observe | None = None,
+    divergence_bound: float = 1e6,
+) -> Samples:
+    """Algorithm 1 (and 2): predict, then project, from i = L to 1.
+
+    Args:
+        denoise: (tau_i, i, E) -> tau0_hat, of the shape of tau_i.
+        environment: E (..., c), aligned with the plans; its device is where the chain runs.
+        shape: (*robots, ..., d) of the plans.
+        generator: of all noise; on the CPU, so that the same seed gives the same noise on every device.
+        project, enforcement: P and where it acts; None for vanilla diffusion.
+        observe: is shown the sample after each prediction and after each projection.
+        divergence_bound: the chain stops once max |tau| exceeds it.
+
+    Returns:
+        float64 plans; the chain as it stood if it diverged.
+    """
+
+    def noise() -> Tensor:
+        return torch.randn(shape, generator=generator, dtype=torch.float64).to(environment.device)
+
+    tau, calls = noise(), 0
+    for step in sampler.steps(schedule):
+        tau0_hat = torch.zeros_like(tau)
+        if step.call:
+            tau0_hat, calls = denoise(tau, step.i, environment), calls + 1
+            if project and enforcement:
+                tau0_hat = enforcement.clean(tau0_hat, project, schedule, step.j)
+        tau = step.clean * tau0_hat + step.sample * tau
+        if step.noise:
+            tau = tau + step.noise * noise()
+        if observe:
+            observe(step.j, "predict", tau)
+        if project and enforcement:
+            tau = enforcement.sample(tau, project, schedule, step.j)
+        if observe:
+            observe(step.j, "project", tau)
+        if not tau.abs().max() <= divergence_bound:
+            return Samples(tau, calls, diverged_at=step.i)
+    if project and enforcement:
+        tau = enforcement.end(tau, project)
+    return Samples(tau, calls)

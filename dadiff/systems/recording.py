@@ -1,0 +1,72 @@
+"""Recordings: the long experiment Γ = [x(0:S); u(0:S-1)] from which unknown dynamics are learned (Section III-B)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from dadiff.errors import ConfigError, ShapeError
+from dadiff.systems.linear import LinearSystem
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One or several experiments of S inputs each.
+
+    Args:
+        states: (*robots, count, S+1, n).
+        inputs: (*robots, count, S, m).
+    """
+
+    states: np.ndarray = field(repr=False)
+    inputs: np.ndarray = field(repr=False)
+
+    def __post_init__(self) -> None:
+        x, u = self.states.shape, self.inputs.shape
+        if len(x) < 3 or len(u) != len(x) or x[:-2] != u[:-2] or x[-2] != u[-2] + 1:
+            raise ShapeError(f"recording: states {x} and inputs {u}; expected (..., count, S+1, n), (..., count, S, m)")
+
+    @property
+    def length(self) -> int:
+        """S, the number of inputs."""
+        return self.inputs.shape[-2]
+
+    @property
+    def count(self) -> int:
+        """Number of experiments."""
+        return self.inputs.shape[-3]
+
+
+@dataclass(frozen=True)
+class GaussianExcitation:
+    """Experiments from rest under white inputs u(t) ~ N(0, input_std^2 I).
+
+    Args:
+        length: S, the number of inputs.
+        input_std: in the units of the input.
+        process_noise: standard deviation of w(t); None takes the system's.
+        count: how many experiments, side by side.
+        seed: of the inputs and the noise.
+    """
+
+    length: int = 100
+    input_std: float = 1.0
+    process_noise: float | None = None
+    count: int = 1
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.length < 1 or self.count < 1:
+            raise ConfigError(f"recording: length is {self.length} and count {self.count}; both must be at least 1")
+        if self.input_std < 0 or (self.process_noise is not None and self.process_noise < 0):
+            raise ConfigError("recording: input_std and process_noise are standard deviations and not negative")
+
+    def record(self, system: LinearSystem, rng: np.random.Generator) -> Recording:
+        """Γ of every robot of the system."""
+        shape = (*system.robots, self.count, self.length)
+        inputs = self.input_std * rng.standard_normal((*shape, system.input_dim))
+        std = system.process_noise if self.process_noise is None else self.process_noise
+        noise = std * rng.standard_normal((*shape, system.state_dim))
+        x_init = np.zeros((*system.robots, self.count, system.state_dim))
+        return Recording(system.simulate(x_init, inputs, noise), inputs)

@@ -1,0 +1,56 @@
+"""Hankel matrices of long experiments (Section III-B).
+
+A recording of length S holds x(0:S) and u(0:S-1): S inputs and S + 1 states. Its Hankel matrix of depth T has
+S - T + 1 columns, one a window: column j is the trajectory that starts at x(j). (The paper's bounds, u(0:S) with
+columns up to u(S-T+1), are off by one against this.)
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dadiff.errors import ExcitationError
+from dadiff.trajectory.layout import Layout
+
+
+def windows(signal: np.ndarray, depth: int) -> np.ndarray:
+    """All windows of a signal (..., S, k): shape (..., S - depth + 1, depth, k)."""
+    return np.moveaxis(np.lib.stride_tricks.sliding_window_view(signal, depth, axis=-2), -1, -2)
+
+
+def block_hankel(signal: np.ndarray, depth: int) -> np.ndarray:
+    """H_depth(signal) of shape (..., k depth, S - depth + 1) from a signal (..., S, k)."""
+    columns = windows(signal, depth)
+    return columns.reshape(*columns.shape[:-2], -1).swapaxes(-1, -2)
+
+
+def minimum_length(layout: Layout, count: int = 1) -> int:
+    """The S from which `count` recordings give the n + mT columns that span the dynamics."""
+    return layout.horizon - 1 + -(-layout.rank // count)
+
+
+def identity_length(layout: Layout, count: int = 1) -> int:
+    """The S from which noisy columns fill R^d, so that H H† is the identity: d columns."""
+    return layout.horizon - 1 + -(-layout.size // count)
+
+
+def trajectory_matrix(states: np.ndarray, inputs: np.ndarray, layout: Layout) -> np.ndarray:
+    """H = [H_{T+1}(x); H_T(u)] of shape (*robots, d, count (S - T + 1)), eq. (10).
+
+    Args:
+        states: (*robots, count, S+1, n); the windows of several recordings stand side by side.
+        inputs: (*robots, count, S, m).
+
+    Raises:
+        ExcitationError: if there are fewer than n + mT columns.
+    """
+    count, length = inputs.shape[-3], inputs.shape[-2]
+    if count * (length - layout.horizon + 1) < layout.rank:
+        recordings = f"{count} recordings" if count > 1 else "the recording"
+        raise ExcitationError(
+            f"recording: S = {length} is too short: {recordings} give {max(0, count * (length - layout.horizon + 1))} "
+            f"windows of T = {layout.horizon}; n + mT = {layout.rank} are needed: record S >= "
+            f"{minimum_length(layout, count)}"
+        )
+    columns = layout.flatten(windows(states, layout.horizon + 1), windows(inputs, layout.horizon))
+    return columns.reshape(*columns.shape[:-3], -1, layout.size).swapaxes(-1, -2)

@@ -1,0 +1,45 @@
+"""Subspaces of trajectories: orthonormal bases, the one rule for ranks, and distances between images."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def rank_tolerance(singular_values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """max(rows, columns) * eps * s_max: below it a singular value counts as zero. The project's one rank rule."""
+    return max(shape[-2:]) * np.finfo(np.float64).eps * singular_values[..., :1]
+
+
+def numerical_rank(M: np.ndarray) -> int:
+    """The rank of M (rows, columns); of a batch, the smallest."""
+    s = np.linalg.svd(M, compute_uv=False)
+    return int((s > rank_tolerance(s, M.shape)).sum(axis=-1).min())
+
+
+def column_basis(M: np.ndarray) -> np.ndarray:
+    """Orthonormal basis (..., rows, columns) of the image of M, which has full column rank."""
+    return np.linalg.qr(M)[0]
+
+
+def null_space(M: np.ndarray) -> np.ndarray:
+    """Orthonormal basis (..., columns, columns - rows) of the kernel of M, which has full row rank."""
+    Q, _ = np.linalg.qr(M.swapaxes(-1, -2), mode="complete")
+    return Q[..., M.shape[-2] :]
+
+
+def largest_angle(U: np.ndarray, V: np.ndarray) -> np.ndarray:
+    """The largest principal angle (radians) between the images of orthonormal bases (..., d, r) and (..., d, s).
+
+    arcsin |P_U - P_V|_2: pi/2 as soon as the dimensions differ.
+    """
+    if U.shape[-1] != V.shape[-1]:
+        return np.full(np.broadcast_shapes(U.shape[:-2], V.shape[:-2]), np.pi / 2)
+    outside = V - U @ (U.swapaxes(-1, -2) @ V)
+    return np.arcsin(np.clip(np.linalg.norm(outside, ord=2, axis=(-2, -1)), 0, 1))
+
+
+def projector_distance(U: np.ndarray, V: np.ndarray) -> np.ndarray:
+    """|P_U - P_V|_F / sqrt(2 s): 0 for equal images, 1 for orthogonal ones of equal dimension s."""
+    r, s = U.shape[-1], V.shape[-1]
+    overlap = (np.square(U.swapaxes(-1, -2) @ V)).sum(axis=(-2, -1))
+    return np.sqrt(np.maximum(r + s - 2 * overlap, 0) / (2 * s))
