@@ -1,0 +1,10 @@
+"""What lies on disk: cached artefacts, finished runs and the sweeps that they belong to.
+
+Everything is written under a temporary name and renamed, so that a reader finds it whole or not at all.
+"""
+
+from dadiff.store.cache import Cache, Entry
+from dadiff.store.results import DONE, Results, StoredRun
+from dadiff.store.sweeps import Cell, Sweep, Sweeps
+
+__all__ = ["DONE", "Cache", "Cell", "Entry", "Results", "StoredRun", "Sweep", "Sweeps"]

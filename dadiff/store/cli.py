@@ -1,0 +1,94 @@
+"""`dadiff-cache`: list, verify and prune what the cache holds."""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import sys
+from collections import Counter
+from pathlib import Path
+
+from dadiff.errors import DadiffError, StoreError
+from dadiff.store.cache import Cache, Entry, damage
+from dadiff.store.results import Results
+
+
+def users(output_dir: Path) -> Counter[tuple[str, str]]:
+    """(kind, key) -> how many stored runs were made with this entry."""
+    links = (run.record.get("links", {}) for run in Results(output_dir))
+    return Counter((kind, key) for link in links for kind, key in link.items() if key)
+
+
+def size_text(size: int) -> str:
+    """A number of bytes for people: "1.4 MB"."""
+    value, units = float(size), iter(("B", "kB", "MB", "GB", "TB"))
+    unit = next(units)
+    while value >= 1000 and unit != "TB":
+        value, unit = value / 1000, next(units)
+    return f"{value:.0f} {unit}" if unit == "B" else f"{value:.1f} {unit}"
+
+
+def list_entries(output_dir: Path) -> list[str]:
+    """One line an entry: kind, key, size, state, number of runs that were made with it."""
+    counts = users(output_dir)
+    lines = [f"{'kind':<10} {'key':<16} {'size':>9}  {'state':<8}  runs"]
+    total = 0
+    for entry in Cache(output_dir).entries():
+        total += entry.size
+        lines.append(_line(entry, counts[entry.kind, entry.key]))
+    return [*lines, f"{'total':<10} {'':<16} {size_text(total):>9}"]
+
+
+def verify(output_dir: Path) -> list[str]:
+    """One line a damaged entry; empty if every checksum holds."""
+    whole = (entry for entry in Cache(output_dir).entries() if entry.state == "whole")
+    damaged = ((entry, damage(entry.folder)) for entry in whole)
+    return [f"{entry.kind} {entry.key}: {'; '.join(problems)}" for entry, problems in damaged if problems]
+
+
+def prune(output_dir: Path, *, dry_run: bool) -> list[str]:
+    """Remove what no stored run was made with, what is damaged and what was left half built.
+
+    Raises:
+        StoreError: while runs are being worked on, since they may need what no stored run needs yet.
+    """
+    if working := Results(output_dir).working_keys():
+        raise StoreError(f"{output_dir}: {len(working)} runs are being worked on; prune when they have ended")
+    counts, lines = users(output_dir), []
+    for entry in Cache(output_dir).entries():
+        if entry.state == "building" or (entry.state == "whole" and counts[entry.kind, entry.key]):
+            continue
+        lines.append(f"{'would remove' if dry_run else 'removed'} {_line(entry, 0)}")
+        if not dry_run:
+            shutil.rmtree(entry.folder)
+    return lines
+
+
+def _line(entry: Entry, count: int) -> str:
+    return f"{entry.kind:<10} {entry.key:<16} {size_text(entry.size):>9}  {entry.state:<8}  {count}"
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser("dadiff-cache", description="Cached data sets, recordings and trained denoisers.")
+    parser.add_argument("action", choices=["list", "verify", "prune"])
+    parser.add_argument("--output-dir", type=Path, default=Path("outputs"), help="where results lie (outputs)")
+    parser.add_argument("--dry-run", action="store_true", help="prune: only say what would be removed")
+    return parser
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The command line; returns its exit code, 1 if `verify` found damage."""
+    given = _parser().parse_args(arguments)
+    try:
+        if given.action == "list":
+            lines, code = list_entries(given.output_dir), 0
+        elif given.action == "verify":
+            damaged = verify(given.output_dir)
+            lines, code = damaged or ["every entry agrees with its checksums"], int(bool(damaged))
+        else:
+            lines, code = prune(given.output_dir, dry_run=given.dry_run) or ["nothing to remove"], 0
+    except DadiffError as error:
+        print(f"dadiff-cache: {error}", file=sys.stderr)
+        return 1
+    print("\n".join(lines))
+    return code

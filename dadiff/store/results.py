@@ -1,0 +1,196 @@
+"""Runs on disk: `runs/<key>` holds `run.json`, `config.yaml`, tables as parquet and arrays as npz.
+
+A run is written into a hidden folder beside its place and renamed, so it is there whole or not at all.
+Numbers that are not finite are null in `run.json` and nan again when read.
+A failed run is recorded too, with its reason; such a record gives way when the run is done again.
+"""
+
+from __future__ import annotations
+
+import math
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from dadiff.errors import StoreError
+from dadiff.store.files import is_locked, locked, make_folder, read_json, sync_folder, write_json
+
+if TYPE_CHECKING:
+    import numpy as np
+    import pandas as pd
+
+DONE = ("finished", "diverged", "infeasible")
+"""Statuses that are results; a run with any other one is done again."""
+
+RECORD = "run.json"
+
+
+@dataclass(frozen=True)
+class StoredRun:
+    """A run as stored: its record at once, its tables and arrays when asked for.
+
+    Args:
+        folder: `runs/<key>`.
+        record: the content of `run.json`.
+    """
+
+    folder: Path
+    record: dict[str, Any]
+
+    @property
+    def key(self) -> str:
+        """The run's content-derived key, 16 hex digits."""
+        return self.record["key"]
+
+    @property
+    def name(self) -> str:
+        """The name for people."""
+        return self.record["name"]
+
+    @property
+    def status(self) -> str:
+        """One of `DONE`, or how the run failed."""
+        return self.record["status"]
+
+    @property
+    def axes(self) -> dict[str, Any]:
+        """The parameters worth showing, flat."""
+        return self.record.get("axes", {})
+
+    @property
+    def metrics(self) -> dict[str, float]:
+        """Headline scalars; nan where a value was not finite."""
+        stored = self.record.get("metrics", {})
+        return {name: math.nan if value is None else float(value) for name, value in stored.items()}
+
+    def has(self, name: str) -> bool:
+        """Whether the run holds this table (without suffix)."""
+        return (self.folder / f"{name}.parquet").is_file()
+
+    def table(self, name: str) -> pd.DataFrame:
+        """One table: "per_step", "per_plan" or "chain".
+
+        Raises:
+            StoreError: if the run has no such table or it is damaged.
+        """
+        import pandas as pd
+
+        path = self.folder / f"{name}.parquet"
+        if not path.is_file():
+            raise StoreError(f"{path}: this run (status {self.status}) has no such table")
+        try:
+            return pd.read_parquet(path)
+        except (OSError, ValueError) as error:
+            raise StoreError(f"{path}: is damaged ({error}); run it again with force=true") from error
+
+    def arrays(self, name: str = "examples") -> dict[str, np.ndarray]:
+        """The arrays of an npz file; empty if the run has none."""
+        import numpy as np
+
+        path = self.folder / f"{name}.npz"
+        if not path.is_file():
+            return {}
+        with np.load(path, allow_pickle=False) as stored:
+            return {key: stored[key] for key in stored.files}
+
+
+class Results:
+    """The runs below an output folder."""
+
+    def __init__(self, output_dir: Path | str) -> None:
+        self.root = Path(output_dir).absolute() / "runs"
+
+    def folder(self, key: str) -> Path:
+        """Where a run lies, whether it exists or not."""
+        return self.root / key
+
+    def status(self, key: str) -> str | None:
+        """The status of a stored run; None if there is none."""
+        return self.read(key).status if (self.folder(key) / RECORD).is_file() else None
+
+    def is_done(self, key: str) -> bool:
+        """Whether the run is finished, or ended in a way that is itself a result."""
+        return self.status(key) in DONE
+
+    def read(self, key: str) -> StoredRun:
+        """One stored run.
+
+        Raises:
+            DataError: if there is none, or its record is damaged.
+            StoreError: if its format is newer than this version reads.
+        """
+        return StoredRun(self.folder(key), read_json(self.folder(key) / RECORD))
+
+    def __iter__(self) -> Iterator[StoredRun]:
+        """All stored runs, failed ones among them, in the order of their names."""
+        runs = [self.read(path.parent.name) for path in self.root.glob(f"[!.]*/{RECORD}")]
+        return iter(sorted(runs, key=lambda run: run.name))
+
+    def working(self, key: str) -> AbstractContextManager[None]:
+        """Claim the run while working on it; a second process that wants it waits, then finds it done."""
+        return locked(self._lock_file(key), f"run {key}")
+
+    def is_working(self, key: str) -> bool:
+        """Whether a living process works on the run."""
+        return is_locked(self._lock_file(key))
+
+    def working_keys(self) -> list[str]:
+        """The runs that living processes work on."""
+        return [lock.stem for lock in sorted(self.root.glob(".locks/*.lock")) if is_locked(lock)]
+
+    def write(
+        self,
+        record: Mapping[str, Any],
+        *,
+        config_text: str = "",
+        tables: Mapping[str, pd.DataFrame] | None = None,
+        arrays: Mapping[str, np.ndarray] | None = None,
+    ) -> StoredRun:
+        """Store a run whole, in place of an older one with its key.
+
+        Args:
+            record: the content of `run.json` without its format; "key", "name" and "status" are needed.
+            config_text: the resolved configuration as yaml, for people.
+            tables: name -> table, each a parquet file.
+            arrays: what goes into `examples.npz`.
+
+        Raises:
+            StoreError: if the folder cannot be written to.
+        """
+        import numpy as np
+
+        key = record["key"]
+        make_folder(self.root)
+        work = self.root / f".writing-{key}"
+        shutil.rmtree(work, ignore_errors=True)
+        make_folder(work)
+        for name, table in (tables or {}).items():
+            table.to_parquet(work / f"{name}.parquet", index=False)
+        if arrays:
+            np.savez(work / "examples.npz", **arrays)
+        if config_text:
+            (work / "config.yaml").write_text(config_text)
+        write_json(work / RECORD, dict(record))
+        sync_folder(work)
+        _replace(work, self.folder(key))
+        return self.read(key)
+
+    def write_failure(self, record: Mapping[str, Any], status: str, reason: str) -> None:
+        """Record how a run failed, unless a result with its key is already there."""
+        if not self.is_done(record["key"]):
+            self.write({**record, "status": status, "reason": reason})
+
+    def _lock_file(self, key: str) -> Path:
+        return self.root / ".locks" / f"{key}.lock"
+
+
+def _replace(new: Path, folder: Path) -> None:
+    old = folder.with_name(f".replaced-{folder.name}")
+    shutil.rmtree(old, ignore_errors=True)
+    if folder.exists():
+        folder.rename(old)
+    new.rename(folder)
+    shutil.rmtree(old, ignore_errors=True)

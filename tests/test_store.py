@@ -1,0 +1,207 @@
+"""Laws of the store: built once, whole or absent, damage is named and mended, failures give way to results."""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import multiprocessing
+import os
+import signal
+import time
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from dadiff.errors import DadiffError, DataError, StoreError
+from dadiff.store import Cache, Cell, Results, Sweep, Sweeps
+from dadiff.store.cli import main as dadiff_cache
+
+KEY = "0123456789abcdef"
+
+
+def build_slowly(log: Path, folder: Path) -> None:
+    with log.open("a") as stream:
+        stream.write(f"{os.getpid()}\n")
+    time.sleep(0.2)
+    np.save(folder / "x.npy", np.arange(5))
+
+
+def get(root: Path, log: Path) -> None:
+    Cache(root).get_or_build("dataset", KEY, {"seed": 1}, partial(build_slowly, log))
+
+
+def build_until_killed(folder: Path) -> None:
+    (folder / "checkpoint").write_text("step 7")
+    (folder / "junk").write_text("half")
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def get_and_die(root: Path) -> None:
+    Cache(root).get_or_build("denoiser", KEY, {}, build_until_killed)
+
+
+def run_process(target, *arguments) -> int | None:
+    process = multiprocessing.get_context("fork").Process(target=target, args=arguments)
+    process.start()
+    process.join()
+    return process.exitcode
+
+
+def record(status: str = "finished", key: str = KEY, **more: object) -> dict[str, object]:
+    return {"key": key, "name": "lqr/known", "status": status, "axes": {"seed": 1}, "metrics": {"gap": 1.5}, **more}
+
+
+def test_eight_processes_on_a_cold_cache_build_once(tmp_path):
+    context = multiprocessing.get_context("fork")
+    workers = [context.Process(target=get, args=(tmp_path, tmp_path / "log")) for _ in range(8)]
+    for worker in workers:
+        worker.start()
+    for worker in workers:
+        worker.join()
+    assert [worker.exitcode for worker in workers] == [0] * 8
+    assert len((tmp_path / "log").read_text().split()) == 1
+
+
+@pytest.mark.parametrize("resumable", [True, False])
+def test_a_killed_build_leaves_no_entry_and_can_go_on(tmp_path, resumable):
+    assert run_process(get_and_die, tmp_path) == -signal.SIGKILL
+    cache, seen = Cache(tmp_path), []
+
+    def build(folder: Path) -> None:
+        seen.extend(sorted(path.name for path in folder.iterdir()))
+        for path in folder.iterdir():
+            path.unlink()
+        (folder / "weights").write_text("w")
+
+    assert not cache.contains("denoiser", KEY)
+    assert [entry.state for entry in cache.entries()] == ["partial"]
+    folder = cache.get_or_build("denoiser", KEY, {}, build, resumable=resumable)
+    assert seen == (["checkpoint", "junk"] if resumable else [])
+    assert sorted(path.name for path in folder.iterdir()) == ["manifest.json", "weights"]
+
+
+@pytest.mark.parametrize("harm", ["change", "truncate", "remove", "manifest"])
+def test_damage_is_named_set_aside_and_rebuilt(tmp_path, caplog, harm):
+    get(tmp_path, tmp_path / "log")
+    folder = Cache(tmp_path).folder("dataset", KEY)
+    payload = folder / "x.npy"
+    if harm == "change":
+        payload.write_bytes(payload.read_bytes()[:-1] + b"!")
+    elif harm == "truncate":
+        payload.write_bytes(payload.read_bytes()[:-1])
+    else:
+        (payload if harm == "remove" else folder / "manifest.json").unlink()
+    with caplog.at_level(logging.WARNING):
+        get(tmp_path, tmp_path / "log")
+    assert ("manifest.json" if harm == "manifest" else "x.npy") in caplog.text
+    assert f"{KEY}.damaged-1" in caplog.text
+    assert sorted(path.name for path in folder.parent.iterdir()) == [KEY, f"{KEY}.damaged-1"]
+    np.testing.assert_array_equal(np.load(payload), np.arange(5))
+
+
+def test_a_builder_that_raises_leaves_no_entry(tmp_path):
+    def build(folder: Path) -> None:
+        raise DataError("no")
+
+    with pytest.raises(DataError):
+        Cache(tmp_path).get_or_build("dataset", KEY, {}, build)
+    with pytest.raises(StoreError, match="wrote no file"):
+        Cache(tmp_path).get_or_build("dataset", KEY, {}, lambda folder: None)
+
+
+def test_a_run_comes_back_as_it_was_stored(tmp_path):
+    table = pd.DataFrame({"t": [0, 1], "gap": [1e-300, np.nan]})
+    results = Results(tmp_path)
+    results.write(
+        record(metrics={"gap": np.float64(math.nan), "rank": np.int64(64)}),
+        config_text="a: 1\n",
+        tables={"per_step": table},
+        arrays={"states": np.ones((2, 3))},
+    )
+    (run,) = results
+    assert math.isnan(run.metrics["gap"]) and run.metrics["rank"] == 64
+    pd.testing.assert_frame_equal(run.table("per_step"), table)
+    assert run.arrays()["states"].shape == (2, 3)
+    assert json.loads((run.folder / "run.json").read_text())["metrics"]["gap"] is None
+    with pytest.raises(StoreError, match="no such table"):
+        run.table("chain")
+
+
+def test_failures_give_way_to_results_and_not_the_other_way(tmp_path):
+    results = Results(tmp_path)
+    results.write_failure(record(), "killed", "SIGKILL")
+    assert results.status(KEY) == "killed" and not results.is_done(KEY)
+    results.write(record())
+    assert results.is_done(KEY)
+    results.write_failure(record(), "failed", "later")
+    assert results.read(KEY).status == "finished"
+    assert [path.name for path in results.root.iterdir()] == [KEY]
+
+
+def test_a_newer_format_is_refused(tmp_path):
+    run = Results(tmp_path).write(record())
+    path = run.folder / "run.json"
+    path.write_text(path.read_text().replace('"format": 1', '"format": 2'))
+    with pytest.raises(StoreError, match="format 2.*update dadiff"):
+        Results(tmp_path).read(KEY)
+    path.write_text("{")
+    with pytest.raises(DataError, match="damaged"):
+        Results(tmp_path).read(KEY)
+
+
+def test_claims_end_with_their_process(tmp_path):
+    results = Results(tmp_path)
+    assert not results.is_working(KEY)
+    with results.working(KEY):
+        assert run_process(exit_with, tmp_path) == 1
+    assert run_process(exit_with, tmp_path) == 0
+    run_process(claim_and_die, tmp_path)
+    assert not results.is_working(KEY)
+
+
+def exit_with(root: Path) -> None:
+    raise SystemExit(int(Results(root).is_working(KEY)))
+
+
+def claim_and_die(root: Path) -> None:
+    with Results(root).working(KEY):
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_sweeps_come_back(tmp_path):
+    sweep = Sweep("quick", "dadiff -m", {"seed": "1,2"}, [Cell(KEY, "lqr/known", {"seed": 1}, "failed", "why")])
+    Sweeps(tmp_path).write(sweep)
+    assert Sweeps(tmp_path).read("quick") == sweep
+    assert Sweeps(tmp_path).names() == ["quick"]
+    with pytest.raises(DadiffError, match="cannot be read"):
+        Sweeps(tmp_path).read("other")
+
+
+def test_an_unwritable_folder_is_one_clear_line(tmp_path):
+    (tmp_path / "cache").write_text("a file")
+    with pytest.raises(StoreError, match="choose another output_dir"):
+        get(tmp_path, tmp_path / "log")
+
+
+def test_the_cache_tool_lists_verifies_and_prunes(tmp_path, capsys):
+    get(tmp_path, tmp_path / "log")
+    Cache(tmp_path).get_or_build("denoiser", "f" * 16, {}, partial(build_slowly, tmp_path / "log"))
+    Results(tmp_path).write(record(links={"dataset": KEY, "denoiser": None}))
+    arguments = ["--output-dir", str(tmp_path)]
+    assert dadiff_cache(["list", *arguments]) == 0
+    listed = capsys.readouterr().out
+    assert KEY in listed and "whole     1" in listed
+    assert dadiff_cache(["prune", *arguments, "--dry-run"]) == 0
+    assert "would remove denoiser" in capsys.readouterr().out
+    assert dadiff_cache(["prune", *arguments]) == 0
+    assert [entry.kind for entry in Cache(tmp_path).entries()] == ["dataset"]
+    assert dadiff_cache(["verify", *arguments]) == 0
+    (Cache(tmp_path).folder("dataset", KEY) / "x.npy").write_bytes(b"")
+    assert dadiff_cache(["verify", *arguments]) == 1
+    assert "x.npy differs from its checksum" in capsys.readouterr().out
+    with Results(tmp_path).working(KEY):
+        assert dadiff_cache(["prune", *arguments]) == 1
