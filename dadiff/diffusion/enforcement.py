@@ -74,18 +74,18 @@ class Convex(Never):
     """a P + (1 - a) I with a = alpha_bar_j, on the sample or on the clean estimate.
 
     Args:
-        on: where it acts.
+        acts_on: where it acts.
     """
 
-    on: Literal["sample", "clean_estimate"] = "sample"
+    acts_on: Literal["sample", "clean_estimate"] = "sample"
 
     def clean(self, tau0_hat: Array, P: Project, schedule: Schedule, j: int) -> Array:
         """tau0_hat + a (P(tau0_hat) - tau0_hat), if it acts here."""
-        return self._blend(tau0_hat, P, schedule.alpha_bar[j]) if self.on == "clean_estimate" else tau0_hat
+        return self._blend(tau0_hat, P, schedule.alpha_bar[j]) if self.acts_on == "clean_estimate" else tau0_hat
 
     def sample(self, tau: Array, P: Project, schedule: Schedule, j: int) -> Array:
         """tau + a (P(tau) - tau), if it acts here."""
-        return self._blend(tau, P, schedule.alpha_bar[j]) if self.on == "sample" else tau
+        return self._blend(tau, P, schedule.alpha_bar[j]) if self.acts_on == "sample" else tau
 
     @staticmethod
     def _blend(tau: Array, P: Project, a: float) -> Array:

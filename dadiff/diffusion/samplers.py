@@ -1,25 +1,17 @@
-"""Samplers: from noise tau_L to a plan tau_0 (Algorithms 1 and 2).
+"""Samplers: with which weights a reverse step combines the clean estimate, the sample and fresh noise.
 
-A sampler says with which weights a step combines the clean estimate, the sample and fresh noise; one loop runs them
-all. With the clean estimate the reverse mean is finite everywhere, also where alpha_bar_L = 0.
+`dadiff.diffusion.chain` runs them all in one loop. Written with the clean estimate, the reverse mean is finite
+everywhere, also where alpha_bar_L = 0.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from math import prod, sqrt
 from typing import Literal, Protocol
 
-import torch
-
-from dadiff.diffusion.enforcement import Enforcement, Project
 from dadiff.diffusion.schedule import Schedule
 from dadiff.errors import ConfigError
-
-Tensor = torch.Tensor
-Denoise = Callable[[Tensor, int, Tensor], Tensor]
-Observe = Callable[[int, Literal["predict", "project"], Tensor], None]
 
 
 @dataclass(frozen=True)
@@ -137,72 +129,3 @@ def skipped_weight(steps: list[Step]) -> float:
             return weight
         weight = step.sample * weight + step.clean
     return weight
-
-
-@dataclass(frozen=True)
-class Samples:
-    """What a run of the chain gives.
-
-    Args:
-        tau: plans (*robots, ..., d) in the sampler's coordinates.
-        network_calls: how often the denoiser was called.
-        diverged_at: the step at which a value left the bound or float range, or None.
-    """
-
-    tau: Tensor
-    network_calls: int
-    diverged_at: int | None = None
-
-
-@torch.inference_mode()
-def sample(
-    sampler: Sampler,
-    schedule: Schedule,
-    denoise: Denoise,
-    environment: Tensor,
-    shape: tuple[int, ...],
-    generator: torch.Generator,
-    project: Project | None = None,
-    enforcement: Enforcement | None = None,
-    observe: Observe | None = None,
-    divergence_bound: float = 1e6,
-) -> Samples:
-    """Algorithm 1 (and 2): predict, then project, from i = L to 1.
-
-    Args:
-        denoise: (tau_i, i, E) -> tau0_hat, of the shape of tau_i.
-        environment: E (..., c), aligned with the plans; its device is where the chain runs.
-        shape: (*robots, ..., d) of the plans.
-        generator: of all noise; on the CPU, so that the same seed gives the same noise on every device.
-        project, enforcement: P and where it acts; None for vanilla diffusion.
-        observe: is shown the sample after each prediction and after each projection.
-        divergence_bound: the chain stops once max |tau| exceeds it.
-
-    Returns:
-        float64 plans; the chain as it stood if it diverged.
-    """
-
-    def noise() -> Tensor:
-        return torch.randn(shape, generator=generator, dtype=torch.float64).to(environment.device)
-
-    tau, calls = noise(), 0
-    for step in sampler.steps(schedule):
-        tau0_hat = torch.zeros_like(tau)
-        if step.call:
-            tau0_hat, calls = denoise(tau, step.i, environment), calls + 1
-            if project and enforcement:
-                tau0_hat = enforcement.clean(tau0_hat, project, schedule, step.j)
-        tau = step.clean * tau0_hat + step.sample * tau
-        if step.noise:
-            tau = tau + step.noise * noise()
-        if observe:
-            observe(step.j, "predict", tau)
-        if project and enforcement:
-            tau = enforcement.sample(tau, project, schedule, step.j)
-        if observe:
-            observe(step.j, "project", tau)
-        if not tau.abs().max() <= divergence_bound:
-            return Samples(tau, calls, diverged_at=step.i)
-    if project and enforcement:
-        tau = enforcement.end(tau, project)
-    return Samples(tau, calls)

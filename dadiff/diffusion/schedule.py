@@ -37,8 +37,8 @@ class Schedule:
         if len(outside):
             i = int(outside[0])
             raise ConfigError(f"schedule: beta_{i} = {beta[i]:g} lies outside [0, 1]; lower the slope or num_steps")
-        if not beta.any():
-            raise ConfigError("schedule: every beta is 0, so nothing is ever noised; raise beta")
+        if beta[1] == 0:
+            raise ConfigError("schedule: beta_1 = 0, so the first step adds no noise and cannot be undone; raise beta")
 
     @property
     def num_steps(self) -> int:

@@ -55,7 +55,7 @@ class AdmissibleSet:
 
     Args:
         layout: of the trajectories.
-        basis: (*robots, d, r) with independent columns.
+        basis: (*robots, d, r) with orthonormal columns.
         lift: (*robots, d, n), or None where x(0) is free.
         notes: what the projector can say of the set, by name: rank, singular-value gap.
     """

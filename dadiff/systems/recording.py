@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from dadiff.errors import ConfigError, ShapeError
+from dadiff.randomness import numpy_generator
 from dadiff.systems.linear import LinearSystem
 
 
@@ -62,8 +63,9 @@ class GaussianExcitation:
         if self.input_std < 0 or (self.process_noise is not None and self.process_noise < 0):
             raise ConfigError("recording: input_std and process_noise are standard deviations and not negative")
 
-    def record(self, system: LinearSystem, rng: np.random.Generator) -> Recording:
+    def record(self, system: LinearSystem) -> Recording:
         """Γ of every robot of the system."""
+        rng = numpy_generator(self.seed, "recording")
         shape = (*system.robots, self.count, self.length)
         inputs = self.input_std * rng.standard_normal((*shape, system.input_dim))
         std = system.process_noise if self.process_noise is None else self.process_noise

@@ -59,6 +59,10 @@ class LQR:
         """(m, m)."""
         return self.input_cost * np.eye(system.input_dim)
 
+    def target(self, system: LinearSystem) -> LinearSystem:
+        """The system itself."""
+        return system
+
     def environment_dim(self, system: LinearSystem) -> int:
         """2n."""
         return 2 * system.state_dim

@@ -64,6 +64,10 @@ class Task(Protocol):
 
     horizon: int
 
+    def target(self, system: LinearSystem) -> LinearSystem:
+        """The system, or the robots, that plans are made for. A task of one system returns it."""
+        ...
+
     def environment_dim(self, system: LinearSystem) -> int:
         """c, the length of the condition vector E."""
         ...

@@ -1,0 +1,122 @@
+"""A run before anything is sampled: its components, and the data and denoiser that follow from them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from dadiff.config import Parts, assemble
+from dadiff.datasets.cached import load_data, save_data
+from dadiff.denoisers.checkpoints import load
+from dadiff.denoisers.learning import train
+from dadiff.errors import ConfigError
+from dadiff.identity import Artefact, Identity, identify
+from dadiff.store import Cache, Results
+from dadiff.systems import LinearSystem
+from dadiff.tasks import Cases, Demonstrations
+from dadiff.trajectory.coordinates import Coordinates, physical, standardised
+from dadiff.trajectory.layout import Layout
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """The components of a run, and what follows from them before anything is sampled."""
+
+    parts: Parts
+    identity: Identity
+    cache: Cache
+    results: Results
+
+    @classmethod
+    def of(cls, config: Mapping[str, Any]) -> Experiment:
+        """Assemble a resolved configuration.
+
+        Raises:
+            ConfigError: if it is not valid.
+        """
+        parts = assemble(config, config.get("choices"))
+        output_dir = Path(parts.settings.output_dir).absolute()
+        return cls(parts, identify(config, parts), Cache(output_dir), Results(output_dir))
+
+    @cached_property
+    def target(self) -> LinearSystem:
+        """The system, or the robots, that plans are made for."""
+        return self.parts["task"].target(self.parts["system"])
+
+    @cached_property
+    def layout(self) -> Layout:
+        """Of this task's trajectories."""
+        return self.target.layout(self.parts["task"].horizon)
+
+    @cached_property
+    def data(self) -> tuple[Demonstrations, Cases]:
+        """Demonstrations and cases, from the cache or made now."""
+        return load_data(self._cached(self.identity.dataset, self._build_dataset))
+
+    @cached_property
+    def coordinates(self) -> Coordinates:
+        """Where diffusion and projection act."""
+        if self.parts.settings.coordinates == "physical":
+            return physical(self.layout)
+        return standardised(self.layout, self.data[0].trajectories)
+
+    @cached_property
+    def device(self) -> str:
+        """cpu or cuda.
+
+        Raises:
+            ConfigError: if cuda is asked for and not there.
+        """
+        wanted, there = self.parts.settings.device, torch.cuda.is_available()
+        if wanted == "cuda" and not there:
+            raise ConfigError("device: cuda is asked for, but torch sees no GPU; use device=auto or device=cpu")
+        return "cuda" if there and wanted != "cpu" else "cpu"
+
+    @cached_property
+    def denoiser(self) -> Any:
+        """The exact denoiser, or the trained one from the cache or trained now."""
+        recipe, schedule = self.parts["denoiser"], self.parts["schedule"]
+        if not recipe.trainable:
+            return recipe.exact(self._law(), self.coordinates, schedule)
+        folder = self._cached(self.identity.denoiser, self._train, resumable=True)
+        environment_dim = self.data[0].environment.shape[-1]
+        return load(folder / "model.safetensors", recipe, self.layout, environment_dim, schedule).to(self.device)
+
+    def prepare(self) -> None:
+        """Build what is shared with other runs."""
+        _ = self.data, self.denoiser
+
+    def _law(self) -> Any:
+        task = self.parts["task"]
+        if not hasattr(task, "law"):
+            raise ConfigError("denoiser: the exact denoiser needs a task whose law is Gaussian; use task=lqr or denoiser=mlp")
+        return task.law(self.target)
+
+    def _cached(self, artefact: Artefact, build: Callable[[Path], None], *, resumable: bool = False) -> Path:
+        return self.cache.get_or_build(
+            artefact.kind, artefact.key, artefact.determined_by, build, resumable=resumable
+        )
+
+    def _build_dataset(self, folder: Path) -> None:
+        dataset, task, system = self.parts["dataset"], self.parts["task"], self.parts["system"]
+        save_data(folder, dataset.train(task, system), dataset.test(task, self.target))
+
+    def _train(self, folder: Path) -> None:
+        demonstrations = self.data[0]
+        train(
+            self.parts["denoiser"],
+            self.layout,
+            self.parts["schedule"],
+            self.parts["training"],
+            self.coordinates.to_scaled(demonstrations.trajectories),
+            demonstrations.environment,
+            folder,
+            device=self.device,
+            augment=getattr(self.parts["task"], "augment", None),
+            progress=self.parts.settings.progress,
+        )

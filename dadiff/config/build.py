@@ -1,0 +1,96 @@
+"""Components from configuration: a mapping with `_target_` becomes an object, after every key and type is checked.
+
+The target's signature is the schema: a dataclass or an annotated function. A misspelt key or a wrong type is an error
+that names the file and the key. Only targets inside this package are built, unless the user names other packages.
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import is_dataclass
+from typing import Any, get_type_hints
+
+from pydantic import ConfigDict, TypeAdapter, ValidationError
+
+from dadiff.errors import ConfigError
+
+TARGET = "_target_"
+STRICT = ConfigDict(strict=True, arbitrary_types_allowed=True)
+
+
+def build(node: Mapping[str, Any], where: str, trusted: Sequence[str] = ()) -> Any:
+    """The component that a configuration node describes.
+
+    Args:
+        node: `_target_` and the target's parameters.
+        where: what to call the node in messages, for example "projector (projector/known.yaml)".
+        trusted: packages besides this one whose targets may be built.
+
+    Raises:
+        ConfigError: on an unknown key, a missing one, a wrong type, or a target that is not trusted or not there.
+    """
+    target = resolve(node, where, trusted)
+    return target(**check(node, target, where))
+
+
+def completed(node: Mapping[str, Any], where: str, trusted: Sequence[str] = ()) -> dict[str, Any]:
+    """The node with every parameter that it leaves to its default, so that both spellings are one identity."""
+    target = resolve(node, where, trusted)
+    given = check(node, target, where)
+    defaults = {
+        name: p.default for name, p in inspect.signature(target).parameters.items() if p.default is not p.empty
+    }
+    return {TARGET: node[TARGET], **defaults, **given}
+
+
+def resolve(node: Mapping[str, Any], where: str, trusted: Sequence[str] = ()) -> Callable[..., Any]:
+    """Import the node's target.
+
+    Raises:
+        ConfigError: if it is missing, not trusted, or cannot be found.
+    """
+    path = node.get(TARGET)
+    if not isinstance(path, str) or "." not in path:
+        raise ConfigError(f"{where}: {TARGET} is {path!r}; expected the dotted name of a class or function")
+    if path.split(".")[0] not in {"dadiff", *trusted}:
+        raise ConfigError(
+            f"{where}: {TARGET} {path} lies outside dadiff and is not built; "
+            f"to trust its package add components=[{path.split('.')[0]}]"
+        )
+    module, _, name = path.rpartition(".")
+    try:
+        return getattr(importlib.import_module(module), name)
+    except (ModuleNotFoundError, AttributeError) as error:
+        raise ConfigError(f"{where}: {TARGET} {path} cannot be found ({error})") from error
+
+
+def check(node: Mapping[str, Any], target: Callable[..., Any], where: str) -> dict[str, Any]:
+    """The node's parameters, checked against the target's signature."""
+    parameters = inspect.signature(target).parameters
+    plain_class = inspect.isclass(target) and not is_dataclass(target)
+    hints = get_type_hints(target.__init__ if plain_class else target)
+    given = {key: value for key, value in node.items() if key != TARGET}
+    for key in given:
+        if key not in parameters:
+            raise ConfigError(f"{where}: {_unknown(key, list(parameters))}")
+    for name, parameter in parameters.items():
+        if parameter.default is parameter.empty and given.get(name) is None:
+            raise ConfigError(f"{where}: {name} is missing; give {where.split()[0]}.{name}=...")
+    return {key: _typed(value, hints[key], f"{where}: {key}") for key, value in given.items()}
+
+
+def _unknown(key: str, known: list[str]) -> str:
+    close = difflib.get_close_matches(key, known, 1)
+    advice = f"did you mean {close[0]}?" if close else f"known keys: {', '.join(known) or 'none'}"
+    return f"key {key!r} is not known; {advice}"
+
+
+def _typed(value: Any, hint: Any, where: str) -> Any:
+    try:
+        return TypeAdapter(hint, config=STRICT).validate_python(value)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise ConfigError(f"{where} is {first['input']!r}: {first['msg'][0].lower()}{first['msg'][1:]}") from error

@@ -1,0 +1,28 @@
+"""From Hydra's composed configuration to plain data."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
+
+from dadiff.config.settings import GROUPS
+from dadiff.errors import ConfigError
+
+
+def plain(config: DictConfig, choices: Mapping[str, str]) -> dict[str, Any]:
+    """The resolved configuration without Hydra's own node, with the chosen preset of each group under `choices`.
+
+    Raises:
+        ConfigError: if a mandatory value is missing or an interpolation leads nowhere.
+    """
+    try:
+        content = OmegaConf.masked_copy(config, [key for key in config if key != "hydra"])
+        result = OmegaConf.to_container(content, resolve=True, throw_on_missing=True)
+    except MissingMandatoryValue as error:
+        raise ConfigError(f"{error.full_key} is missing; give {error.full_key}=...") from error
+    except OmegaConfBaseException as error:
+        raise ConfigError(str(error).splitlines()[0]) from error
+    return {**result, "choices": {group: choices[group] for group in GROUPS if group in choices}}  # type: ignore[dict-item]

@@ -1,0 +1,106 @@
+"""The configuration as a whole: its groups, its top-level settings, and its assembly into components."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from typing import Any, Literal
+
+from dadiff.config.build import TARGET, build, check, completed
+from dadiff.errors import ConfigError
+
+GROUPS = (
+    "system",
+    "task",
+    "dataset",
+    "recording",
+    "schedule",
+    "denoiser",
+    "training",
+    "sampler",
+    "projector",
+    "enforcement",
+    "evaluation",
+    "tracking",
+)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What stands beside the groups.
+
+    Args:
+        seed: the root seed; each role derives its own stream.
+        coordinates: where diffusion and projection act: `physical` units (the paper), or `standardised` channels.
+        device: `auto` takes a GPU if there is one.
+        output_dir: where everything is written.
+        components: packages besides dadiff whose classes a configuration may name.
+        force: run again what is finished.
+        dry_run: say what would run, and stop.
+        progress: show progress bars.
+        choices: the preset chosen in each group, for names and messages; filled in by the command line.
+    """
+
+    seed: int = 0
+    coordinates: Literal["physical", "standardised"] = "physical"
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    output_dir: str = "outputs"
+    components: Sequence[str] = ()
+    force: bool = False
+    dry_run: bool = False
+    progress: bool = True
+    choices: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Parts:
+    """A configuration's settings and components, by group."""
+
+    settings: Settings
+    components: Mapping[str, Any]
+
+    def __getitem__(self, group: str) -> Any:
+        return self.components[group]
+
+
+def settings_of(config: Mapping[str, Any]) -> Settings:
+    """The checked top-level settings.
+
+    Raises:
+        ConfigError: on an unknown key, a missing group or a wrong type.
+    """
+    top = {key: value for key, value in config.items() if key not in GROUPS}
+    return Settings(**check(top, Settings, "config.yaml"))
+
+
+def assemble(config: Mapping[str, Any], choices: Mapping[str, str] | None = None) -> Parts:
+    """Build every component of a resolved configuration.
+
+    Args:
+        config: nested plain mapping.
+        choices: group -> name of the preset, so that messages can name the file.
+    """
+    settings = settings_of(config)
+    components = {
+        group: build(_node(config, group), where(group, choices), settings.components) for group in GROUPS
+    }
+    return Parts(settings, components)
+
+
+def complete(config: Mapping[str, Any]) -> dict[str, Any]:
+    """The configuration with every default written out."""
+    settings = settings_of(config)
+    groups = {group: completed(_node(config, group), group, settings.components) for group in GROUPS}
+    return {**{f.name: getattr(settings, f.name) for f in fields(settings)}, **groups}
+
+
+def where(group: str, choices: Mapping[str, str] | None = None) -> str:
+    """How messages name a group: with its file, where that is known."""
+    return f"{group} ({group}/{choices[group]}.yaml)" if choices and group in choices else group
+
+
+def _node(config: Mapping[str, Any], group: str) -> Mapping[str, Any]:
+    node = config.get(group)
+    if not isinstance(node, Mapping) or TARGET not in node:
+        raise ConfigError(f"{group}: no component is configured; choose one with {group}=...")
+    return node

@@ -1,0 +1,150 @@
+"""Trajectories in folders of .npz files, one file a trajectory, from any source.
+
+Files are read without pickle, so nothing in them is executed. Every complaint names the file and the array.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from dadiff.errors import ConfigError, DataError
+from dadiff.systems import LinearSystem, Recording
+from dadiff.tasks import Cases, Demonstrations, Task
+
+INPUT_NAMES = ("inputs", "controls")
+
+
+def list_files(folder: Path) -> list[Path]:
+    """The .npz files of a folder, sorted by name.
+
+    Raises:
+        DataError: if the folder is missing or holds none.
+    """
+    if not folder.is_dir():
+        raise DataError(f"{folder}: there is no such folder; expected a folder of .npz files")
+    files = sorted(folder.glob("*.npz"))
+    if not files:
+        raise DataError(f"{folder}: holds no .npz file; expected one for each trajectory")
+    return files
+
+
+def fingerprint(folder: Path) -> str:
+    """A hash of the names and contents of all .npz files below a folder."""
+    digest = hashlib.sha256()
+    for file in sorted(folder.rglob("*.npz")):
+        digest.update(file.relative_to(folder).as_posix().encode())
+        digest.update(file.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def read_array(file: Path, names: Sequence[str], shape: tuple[int | None, ...]) -> np.ndarray:
+    """One float64 array from an .npz file.
+
+    Args:
+        names: accepted names, the first that is there is read.
+        shape: expected shape; None accepts any length.
+
+    Raises:
+        DataError: if it is missing, holds objects, has another shape, or values that are not finite.
+    """
+    label = " or ".join(names)
+    try:
+        with np.load(file, allow_pickle=False) as archive:
+            present = [name for name in names if name in archive]
+            if not present:
+                raise DataError(f"{file}: has no array {label}; found {', '.join(archive.files) or 'none'}")
+            array = np.asarray(archive[present[0]], dtype=np.float64)
+    except (zipfile.BadZipFile, OSError, EOFError) as error:
+        raise DataError(f"{file}: is not a readable .npz file ({error})") from error
+    except ValueError as error:
+        raise DataError(f"{file}: array {label} does not hold plain numbers ({error})") from error
+    expected = "(" + ", ".join("any" if k is None else str(k) for k in shape) + ")"
+    if array.ndim != len(shape) or any(k not in (None, size) for k, size in zip(shape, array.shape, strict=True)):
+        raise DataError(f"{file}: array {label} has shape {array.shape}; expected {expected}")
+    if not np.isfinite(array).all():
+        raise DataError(f"{file}: array {label} holds a value that is not finite")
+    return array
+
+
+@dataclass(frozen=True)
+class NpzTrajectories:
+    """Demonstrations and test cases from `path`/train and `path`/test.
+
+    Each file holds `states (T+1, n)`, `inputs` or `controls (T, m)`, `initial_state (n,)` and `target_state (n,)`;
+    other arrays are ignored. The reference of a test case is its stored trajectory, and E = [x_init; x_target].
+
+    Args:
+        path: the folder.
+        train_size, test_size: how many files to take, in the order of their names; None takes all.
+    """
+
+    path: str
+    train_size: int | None = None
+    test_size: int | None = None
+
+    def fingerprint(self) -> str:
+        """What the folder holds, in place of where it lies."""
+        for part in ("train", "test"):
+            list_files(Path(self.path) / part)
+        return fingerprint(Path(self.path))
+
+    def train(self, task: Task, system: LinearSystem) -> Demonstrations:
+        """The trajectories of `path`/train."""
+        tau, environment = self._read("train", task, system, self.train_size)
+        return Demonstrations(tau, environment)
+
+    def test(self, task: Task, system: LinearSystem) -> Cases:
+        """The cases of `path`/test."""
+        tau, environment = self._read("test", task, system, self.test_size)
+        return Cases(environment, environment[:, : system.state_dim], tau)
+
+    def _read(self, part: str, task: Task, system: LinearSystem, count: int | None) -> tuple[np.ndarray, np.ndarray]:
+        n, m, T = system.state_dim, system.input_dim, task.horizon
+        if task.environment_dim(system) != 2 * n:
+            raise ConfigError(
+                f"dataset: npz files give E = [x_init; x_target] with {2 * n} entries, but the task's E has "
+                f"{task.environment_dim(system)}; use dataset=environments for own environments of this task"
+            )
+        files = list_files(Path(self.path) / part)[:count]
+        states = np.stack([read_array(f, ["states"], (T + 1, n)) for f in files])
+        inputs = np.stack([read_array(f, INPUT_NAMES, (T, m)) for f in files])
+        ends = [[read_array(f, [name], (n,)) for name in ("initial_state", "target_state")] for f in files]
+        return system.layout(T).flatten(states, inputs), np.array(ends).reshape(len(files), 2 * n)
+
+
+@dataclass(frozen=True)
+class NpzRecordings:
+    """Own recordings Γ: a folder of .npz files with `states (S+1, n)` and `inputs` or `controls (S, m)`, equal in S.
+
+    Args:
+        path: the folder.
+    """
+
+    path: str
+
+    def fingerprint(self) -> str:
+        """What the folder holds, in place of where it lies."""
+        list_files(Path(self.path))
+        return fingerprint(Path(self.path))
+
+    def record(self, system: LinearSystem) -> Recording:
+        """All files side by side.
+
+        Raises:
+            DataError: if a file's sizes disagree with the system or with the first file.
+        """
+        if system.robots:
+            raise ConfigError("recording: npz recordings belong to one system, and here are several robots")
+        files = list_files(Path(self.path))
+        inputs = [read_array(f, INPUT_NAMES, (None, system.input_dim)) for f in files]
+        for file, u in zip(files, inputs, strict=True):
+            if len(u) != len(inputs[0]):
+                raise DataError(f"{file}: has S = {len(u)} inputs, {files[0].name} has {len(inputs[0])}; cut to equal S")
+        states = [read_array(f, ["states"], (len(inputs[0]) + 1, system.state_dim)) for f in files]
+        return Recording(np.stack(states), np.stack(inputs))

@@ -1,0 +1,54 @@
+"""Errors of plans against the reference, along time: what every task shares.
+
+All are squared Euclidean norms, as in the paper's figures. Plans have shape (*robots, cases, samples, d), references
+(*robots, cases, d).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dadiff.systems import LinearSystem
+from dadiff.tasks import Cases, Scores
+from dadiff.trajectory.layout import Layout
+from dadiff.trajectory.response import along
+
+
+def _squared(difference: np.ndarray) -> np.ndarray:
+    return np.square(difference).sum(axis=-1)
+
+
+def _to_horizon(values: np.ndarray) -> np.ndarray:
+    """(..., T) to (..., T+1): nan at t = T, where there is no input."""
+    return np.concatenate([values, np.full((*values.shape[:-1], 1), np.nan)], axis=-1)
+
+
+def replay(system: LinearSystem, layout: Layout, planned: np.ndarray, x_init: np.ndarray) -> np.ndarray:
+    """The trajectories (*robots, cases, samples, d) that the planned inputs give from x_init, without noise."""
+    inputs = layout.inputs(planned)
+    return layout.flatten(system.simulate(x_init[..., None, :], inputs), inputs)
+
+
+def dynamics_residual(system: LinearSystem, layout: Layout, tau: np.ndarray) -> np.ndarray:
+    """|x(t+1) - A x(t) - B u(t)|^2 for t = 0..T-1, (..., T)."""
+    x, u = layout.split(tau)
+    return _squared(x[..., 1:, :] - along(system.A, x[..., :-1, :]) - along(system.B, u))
+
+
+def tracking_errors(
+    system: LinearSystem, layout: Layout, cases: Cases, planned: np.ndarray, rollout: np.ndarray
+) -> Scores:
+    """State and input errors as planned and after replay, the gap between the two, and the dynamics' residual."""
+    x, u = layout.split(planned)
+    x_replayed = layout.states(rollout)
+    x_ref, u_ref = (part[..., None, :, :] for part in layout.split(cases.reference))
+    return Scores(
+        per_step={
+            "planned_state_error": _squared(x - x_ref),
+            "planned_input_error": _to_horizon(_squared(u - u_ref)),
+            "rollout_state_error": _squared(x_replayed - x_ref),
+            "gap": _squared(x - x_replayed),
+            "dynamics_residual": _to_horizon(dynamics_residual(system, layout, planned)),
+        },
+        per_plan={"initial_state_error": _squared(x[..., 0, :] - cases.x_init[..., None, :])},
+    )

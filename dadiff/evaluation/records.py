@@ -1,0 +1,105 @@
+"""What is kept of a run: long tables of scores, headline means, and what was seen along the chain."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+import pandas as pd
+
+from dadiff.tasks import Scores
+
+Observe = Callable[[int, Literal["predict", "project"], Any], None]
+Distance = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+
+SHOWN_SIGNAL = (0.0, 0.05, 0.25, 0.5, 0.75, 0.95, 1.0)
+
+
+def merged(*scores: Scores) -> Scores:
+    """All scores in one."""
+    return Scores(
+        {k: v for s in scores for k, v in s.per_plan.items()}, {k: v for s in scores for k, v in s.per_step.items()}
+    )
+
+
+def long_table(values: dict[str, np.ndarray], axes: tuple[str, ...]) -> pd.DataFrame:
+    """Arrays of one shape as a table with a row an entry; `axes` names the last dimensions, robots come first."""
+    shape = next(iter(values.values())).shape
+    names = ("robot", *axes) if len(shape) > len(axes) else axes
+    index = np.indices(shape, dtype=np.int32).reshape(len(shape), -1)
+    columns = {name: column.ravel().astype(np.float32) for name, column in values.items()}
+    return pd.DataFrame({**dict(zip(names, index, strict=True)), **columns})
+
+
+def tables(scores: Scores) -> dict[str, pd.DataFrame]:
+    """`per_step` and `per_plan`."""
+    return {
+        "per_step": long_table(scores.per_step, ("case", "sample", "t")),
+        "per_plan": long_table(scores.per_plan, ("case", "sample")),
+    }
+
+
+def headline(scores: Scores) -> dict[str, float]:
+    """The mean of every score over robots, cases, samples and time, leaving out where it is not defined."""
+    return {name: float(np.nanmean(values)) for name, values in {**scores.per_step, **scores.per_plan}.items()}
+
+
+@dataclass
+class ChainRecorder:
+    """The Mahalanobis distance of Theorem 1 after each prediction and each projection, averaged over plans.
+
+    Args:
+        distance: of plans (k, d) in physical units, on and off the support.
+        plans: indices of the k plans that are followed.
+        to_physical: from the sampler's coordinates.
+    """
+
+    distance: Distance
+    plans: np.ndarray
+    to_physical: Callable[[np.ndarray], np.ndarray]
+    rows: list[dict[str, Any]] = field(default_factory=list)
+    _last: np.ndarray | None = None
+
+    def __call__(self, j: int, stage: Literal["predict", "project"], tau: Any) -> None:
+        """Record one half-step that reached step j."""
+        on, off = self.distance(self.to_physical(tau[self.plans].cpu().numpy()))
+        grew = float("nan") if self._last is None else float((on > self._last * (1 + 1e-9)).mean())
+        self.rows.append({"i": j, "stage": stage, "on_support": on.mean(), "off_support": off.mean(), "grew": grew})
+        self._last = on
+
+    def table(self) -> pd.DataFrame:
+        """One row a half-step."""
+        return pd.DataFrame(self.rows)
+
+
+@dataclass
+class Snapshots:
+    """One plan at a few steps of the chain, chosen by how much signal is left, for the panel of Fig. 1.
+
+    Args:
+        alpha_bar: of the schedule, (L+1,).
+        plan: which plan, as an index into the leading dimensions.
+    """
+
+    alpha_bar: np.ndarray
+    plan: tuple[int, ...]
+    taken: dict[int, np.ndarray] = field(default_factory=dict)
+
+    @property
+    def steps(self) -> list[int]:
+        """The steps nearest to the shown shares of signal sqrt(alpha_bar)."""
+        signal = np.sqrt(self.alpha_bar)
+        return sorted({int(np.abs(signal - s).argmin()) for s in SHOWN_SIGNAL}, reverse=True)
+
+    def __call__(self, j: int, stage: Literal["predict", "project"], tau: Any) -> None:
+        """Keep the plan after projection, the nearest visited step at or below each shown one."""
+        if stage == "project":
+            for step in self.steps:
+                if j <= step and step not in self.taken:
+                    self.taken[step] = tau[self.plan].cpu().numpy().copy()
+
+    def stacked(self) -> tuple[np.ndarray, np.ndarray]:
+        """(steps, plans (k, d)), in the order of the chain."""
+        return np.array(list(self.taken)), np.array(list(self.taken.values()))

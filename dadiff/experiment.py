@@ -1,0 +1,219 @@
+"""One run, from configuration to stored result: the place where all rooms meet.
+
+    prepare   builds what the run shares with others: the data set and the trained denoiser
+    execute   samples plans for every test case, evaluates them, and stores the result whole
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+import yaml
+
+from dadiff.assembly import Experiment
+from dadiff.diffusion.chain import Samples, sample
+from dadiff.errors import ConfigError
+from dadiff.evaluation import replay, tracking_errors
+from dadiff.evaluation.mahalanobis import MahalanobisDistance
+from dadiff.evaluation.records import ChainRecorder, Snapshots, headline, merged, tables
+from dadiff.projectors import AdmissibleSet, Known, Projection
+from dadiff.provenance import provenance
+from dadiff.randomness import numpy_generator, torch_generator
+from dadiff.store import StoredRun
+from dadiff.tasks import Scores
+from dadiff.trajectory.subspace import largest_angle, projector_distance
+
+
+@dataclass
+class Timed:
+    """A projection that counts its calls and the seconds they take."""
+
+    project: Callable[[torch.Tensor], torch.Tensor]
+    calls: int = 0
+    seconds: float = 0.0
+
+    def __call__(self, tau: torch.Tensor) -> torch.Tensor:
+        """Project."""
+        start = time.perf_counter()
+        result = self.project(tau)
+        self.seconds += time.perf_counter() - start
+        self.calls += 1
+        return result
+
+
+@dataclass
+class Plans:
+    """What sampling gave, in physical units, and what it took."""
+
+    planned: np.ndarray
+    samples: Samples
+    measures: dict[str, float]
+    chain: ChainRecorder | None
+    snapshots: Snapshots
+
+
+def execute(config: Mapping[str, Any]) -> StoredRun:
+    """Run one resolved configuration, or return its stored result.
+
+    Raises:
+        DadiffError: if the configuration, the data or the store do not allow it.
+    """
+    experiment = Experiment.of(config)
+    results, key = experiment.results, experiment.identity.key
+    with results.working(key):
+        if results.is_done(key) and not experiment.parts.settings.force:
+            return results.read(key)
+        started = time.time()
+        plans = draw_plans(experiment)
+        return _store(experiment, config, plans, started)
+
+
+def prepare(config: Mapping[str, Any]) -> None:
+    """Build the data set and the trained denoiser of a resolved configuration."""
+    Experiment.of(config).prepare()
+
+
+def projection_of(experiment: Experiment, x_init: np.ndarray) -> tuple[Projection | None, dict[str, float]]:
+    """The projection bound to coordinates and cases, and what is measured of it.
+
+    Args:
+        x_init: (*robots, plans, n).
+    """
+    projector, layout = experiment.parts["projector"], experiment.layout
+    recording = experiment.parts["recording"].record(experiment.target) if projector.needs == "recording" else None
+    start = time.perf_counter()
+    fitted = projector.fit(layout, system=experiment.target, recording=recording)
+    if fitted is None:
+        return None, {}
+    projection = fitted.projection(experiment.coordinates, x_init)
+    measures = {"projector_setup_seconds": time.perf_counter() - start, **fitted.notes}
+    if isinstance(fitted, AdmissibleSet) and recording is not None:
+        truth = Known(projector.initial_state).fit(layout, experiment.target).basis
+        measures["principal_angle"] = float(np.mean(largest_angle(fitted.basis, truth)))
+        measures["projector_distance"] = float(np.mean(projector_distance(fitted.basis, truth)))
+    return projection, measures
+
+
+def draw_plans(experiment: Experiment) -> Plans:
+    """Sample plans for every case, with the same noise whatever the projector."""
+    _check_enforcement(experiment)
+    parts, (_, cases) = experiment.parts, experiment.data
+    evaluation, schedule, denoiser = parts["evaluation"], parts["schedule"], experiment.denoiser
+    environment = np.repeat(cases.environment, evaluation.samples, axis=-2)
+    projection, measures = projection_of(experiment, np.repeat(cases.x_init, evaluation.samples, axis=-2))
+    project = Timed(projection.map(lambda a: torch.as_tensor(a, device=experiment.device))) if projection else None
+    chain, snapshots = _observers(experiment, environment)
+    shape = (*environment.shape[:-1], experiment.layout.size)
+    start = time.perf_counter()
+    samples = sample(
+        parts["sampler"], schedule, denoiser, torch.as_tensor(environment, device=experiment.device), shape,
+        torch_generator(evaluation.seed, "sampling noise"), project, parts["enforcement"],
+        lambda j, stage, tau: [see(j, stage, tau) for see in (chain, snapshots) if see],
+        evaluation.divergence_bound, parts.settings.progress,
+    )  # fmt: skip
+    measures |= {"sampling_seconds": time.perf_counter() - start, "network_calls": samples.network_calls}
+    if project and project.calls:
+        measures |= {"projection_seconds": project.seconds / project.calls, "projection_calls": project.calls}
+    tau = samples.tau.cpu().numpy().reshape(*cases.environment.shape[:-1], evaluation.samples, -1)
+    return Plans(experiment.coordinates.to_physical(tau), samples, measures, chain, snapshots)
+
+
+def _check_enforcement(experiment: Experiment) -> None:
+    parts = experiment.parts
+    if getattr(parts["projector"], "initial_state", "free") == "fixed" and not parts["enforcement"].affine:
+        raise ConfigError(
+            "enforcement: literal scales the sample, which is meaningless for the affine set of x(0) = x_init; "
+            "use projector.initial_state=free or another enforcement"
+        )
+
+
+def _observers(experiment: Experiment, environment: np.ndarray) -> tuple[ChainRecorder | None, Snapshots]:
+    """The recorder of Theorem 1, where the law is known and there is one system; and snapshots of the first plan."""
+    parts = experiment.parts
+    snapshots = Snapshots(parts["schedule"].alpha_bar, (0,) * (environment.ndim - 1))
+    if parts["denoiser"].trainable or environment.ndim > 2:
+        return None, snapshots
+    followed = np.arange(0, len(environment), parts["evaluation"].samples)
+    distance = MahalanobisDistance.of(parts["task"].law(experiment.target), environment[followed])
+    return ChainRecorder(distance, followed, experiment.coordinates.to_physical), snapshots
+
+
+def _store(experiment: Experiment, config: Mapping[str, Any], plans: Plans, started: float) -> StoredRun:
+    """Evaluate and write. Of a diverged chain nothing but where it diverged, and how its distance went."""
+    identity, diverged_at = experiment.identity, plans.samples.diverged_at
+    artefacts = (identity.dataset, identity.denoiser, identity.recording)
+    record = {
+        "key": identity.key,
+        "name": identity.name,
+        "status": "finished" if diverged_at is None else "diverged",
+        "reason": None if diverged_at is None else f"a value exceeded the bound at step {diverged_at}",
+        "diverged_step": diverged_at,
+        "config": dict(config),
+        "axes": identity.axes,
+        "metrics": plans.measures,
+        "notes": {"dataset": experiment.data[1].notes, "schedule": experiment.parts["schedule"].conditions()},
+        "counts": _counts(experiment),
+        "links": {artefact.kind: artefact.key for artefact in artefacts if artefact},
+        "provenance": provenance(experiment.device, started),
+    }
+    written = {"chain": plans.chain.table()} if plans.chain else {}
+    arrays = {}
+    if diverged_at is None:
+        scores = evaluate(experiment, plans.planned)
+        record["metrics"] = {**headline(scores), **plans.measures}
+        written |= tables(scores)
+        arrays = examples(experiment, plans)
+    text = yaml.safe_dump(dict(config), sort_keys=False)
+    return experiment.results.write(record, config_text=text, tables=written, arrays=arrays)
+
+
+def evaluate(experiment: Experiment, planned: np.ndarray) -> Scores:
+    """What can be said of plans (*robots, cases, samples, d): errors along time, and the task's own scores."""
+    system, layout, cases = experiment.target, experiment.layout, experiment.data[1]
+    rollout = replay(system, layout, planned, cases.x_init)
+    return merged(
+        tracking_errors(system, layout, cases, planned, rollout),
+        experiment.parts["task"].score(system, cases, planned, rollout),
+    )
+
+
+def examples(experiment: Experiment, plans: Plans) -> dict[str, np.ndarray]:
+    """The first cases' plans, for figures, and one plan along the chain beside its noised reference."""
+    layout, cases = experiment.layout, experiment.data[1]
+    first = (..., slice(experiment.parts["evaluation"].examples), slice(None))
+    planned = plans.planned[..., : experiment.parts["evaluation"].examples, :, :]
+    reference, environment, x_init = cases.reference[first], cases.environment[first], cases.x_init[first]
+    steps, chain = plans.snapshots.stacked()
+    states, inputs = layout.split(planned)
+    reference_states, reference_inputs = layout.split(reference)
+    noised = _noised(experiment, cases.reference[plans.snapshots.plan[:-1] + (0,)], steps)
+    return {
+        "states": states,
+        "inputs": inputs,
+        "rollout_states": layout.states(replay(experiment.target, layout, planned, x_init)),
+        "reference_states": reference_states,
+        "reference_inputs": reference_inputs,
+        "environment": environment,
+        "chain_steps": steps,
+        "chain_states": layout.states(experiment.coordinates.to_physical(chain)),
+        "noised_states": layout.states(noised),
+    }
+
+
+def _noised(experiment: Experiment, reference: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """The forward process applied to a reference (d,): sqrt(alpha_bar_i) z + sqrt(1 - alpha_bar_i) eps, (k, d)."""
+    alpha_bar = experiment.parts["schedule"].alpha_bar[steps][:, None]
+    eps = numpy_generator(experiment.parts["evaluation"].seed, "forward noise").standard_normal(reference.shape)
+    z = experiment.coordinates.to_scaled(reference)
+    return experiment.coordinates.to_physical(np.sqrt(alpha_bar) * z + np.sqrt(1 - alpha_bar) * eps)
+
+
+def _counts(experiment: Experiment) -> dict[str, int]:
+    *robots, num_cases, _ = experiment.data[1].environment.shape
+    counts = {"cases": num_cases, "samples": experiment.parts["evaluation"].samples}
+    return counts | ({"robots": robots[0]} if robots else {})

@@ -1,0 +1,127 @@
+"""What a run is: a stable key from everything that can change its result, and a name for people.
+
+The key is a hash of the complete configuration without what cannot matter: paths, tracking, device, verbosity; the
+recording where no projector reads it, the enforcement where nothing is projected, the training where nothing is
+trained. Data from files count by content, not by place. The same rule keys data sets, recordings and trainings, so
+that cells of a sweep share them. Free of torch.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from dadiff.config.build import TARGET
+from dadiff.config.settings import GROUPS, Parts, assemble, complete
+
+FORMAT = 1  # raised whenever a change moves results; see CHANGELOG
+
+
+@dataclass(frozen=True)
+class Artefact:
+    """A cached thing: its kind ("dataset", "recording", "denoiser"), what determines it, and the hash of that."""
+
+    kind: str
+    determined_by: dict[str, Any]
+
+    @property
+    def key(self) -> str:
+        """16 hexadecimal digits."""
+        return digest(self.determined_by)
+
+
+@dataclass(frozen=True)
+class Identity:
+    """A run's key, name and axes, and what it needs from the cache.
+
+    Args:
+        determined_by: everything that can change the result.
+        name: for people; two runs may share it.
+        axes: flat parameters, the choice of each group under the group's name.
+        dataset, denoiser: None stands for nothing to build.
+    """
+
+    determined_by: dict[str, Any]
+    name: str
+    axes: dict[str, Any]
+    dataset: Artefact
+    denoiser: Artefact | None
+    recording: Artefact | None
+
+    @property
+    def key(self) -> str:
+        """16 hexadecimal digits."""
+        return digest(self.determined_by)
+
+
+def digest(value: Any) -> str:
+    """A stable hash of plain data: 16 hexadecimal digits."""
+    text = json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def identify(config: Mapping[str, Any], parts: Parts | None = None) -> Identity:
+    """The identity of a resolved configuration.
+
+    Args:
+        config: nested plain mapping.
+        parts: its components, if they are assembled already.
+
+    Raises:
+        ConfigError: if the configuration is not valid.
+    """
+    parts = parts or assemble(config, config.get("choices"))
+    nodes = {group: _content(parts[group], node) for group, node in complete(config).items() if group in GROUPS}
+    matters = _groups_that_matter(parts)
+    coordinates = parts.settings.coordinates
+    dataset = Artefact("dataset", {"format": FORMAT, **{g: nodes[g] for g in ("system", "task", "dataset")}})
+    trained = {"dataset": dataset.key, "coordinates": coordinates}
+    denoiser = Artefact("denoiser", trained | {g: nodes[g] for g in ("schedule", "denoiser", "training")})
+    recording = Artefact("recording", {"format": FORMAT, **{g: nodes[g] for g in ("system", "task", "recording")}})
+    determined_by = {"format": FORMAT, "coordinates": coordinates, **{g: nodes[g] for g in matters}}
+    choices = {g: parts.settings.choices.get(g, nodes[g][TARGET].rpartition(".")[2].lower()) for g in matters}
+    return Identity(
+        determined_by,
+        _name(choices, nodes, parts),
+        _axes(choices, nodes, parts),
+        dataset,
+        denoiser if parts["denoiser"].trainable else None,
+        recording if "recording" in matters else None,
+    )
+
+
+def _groups_that_matter(parts: Parts) -> list[str]:
+    ignored = {"tracking"}
+    if not parts["denoiser"].trainable:
+        ignored.add("training")
+    if parts["projector"].needs != "recording":
+        ignored.add("recording")
+    if parts["projector"].needs is None:
+        ignored.add("enforcement")
+    return [group for group in GROUPS if group not in ignored]
+
+
+def _content(component: Any, node: Mapping[str, Any]) -> dict[str, Any]:
+    """The node, with what its files hold in place of their path."""
+    if not hasattr(component, "fingerprint"):
+        return dict(node)
+    return {**{k: v for k, v in node.items() if k != "path"}, "content": component.fingerprint()}
+
+
+def _axes(choices: Mapping[str, str], nodes: Mapping[str, Mapping[str, Any]], parts: Parts) -> dict[str, Any]:
+    leaves = {f"{g}.{k}": v for g in choices for k, v in nodes[g].items() if k != TARGET}
+    initial_state = getattr(parts["projector"], "initial_state", None)
+    settings = {"seed": parts.settings.seed, "coordinates": parts.settings.coordinates, "initial_state": initial_state}
+    return {**choices, **settings, **leaves}
+
+
+def _name(choices: Mapping[str, str], nodes: Mapping[str, Mapping[str, Any]], parts: Parts) -> str:
+    fixed = getattr(parts["projector"], "initial_state", "free") == "fixed"
+    words = [choices["task"], choices["projector"] + ("_fixed" if fixed else "")]
+    if "recording" in choices and "length" in nodes["recording"]:
+        words += [f"S={nodes['recording']['length']}", f"w={nodes['recording']['process_noise']}"]
+    words += [choices[g] for g in ("enforcement", "denoiser", "sampler") if g in choices]
+    return "/".join([*words, f"seed={parts.settings.seed}"])
