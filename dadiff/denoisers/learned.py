@@ -1,0 +1,110 @@
+"""`NetworkDenoiser`: a network, what it predicts, and the scaling of its condition.
+
+This is the one place where the sampler's float64 meets the network's float32.
+"""
+
+from __future__ import annotations
+
+import math
+from contextlib import AbstractContextManager
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from dadiff.denoisers.description import describe
+from dadiff.denoisers.prediction import prediction
+from dadiff.denoisers.recipes import Recipe
+from dadiff.diffusion.schedule import Schedule
+from dadiff.errors import ShapeError
+from dadiff.trajectory import Layout
+
+CHUNK = 1024  # trajectories a network call holds activations for
+
+
+class NetworkDenoiser(nn.Module):
+    """tau0_hat from tau_i, i and E through a trained network.
+
+    Args:
+        network: built `on_meta`; its weights are drawn here.
+        recipe: says what the network predicts.
+        environment_dim: c.
+        generator: the source of the initial weights, on the CPU.
+
+    Attributes:
+        description: what a stored copy of it says of itself.
+    """
+
+    environment_mean: Tensor
+    environment_scale: Tensor
+
+    def __init__(
+        self,
+        network: nn.Module,
+        recipe: Recipe,
+        layout: Layout,
+        environment_dim: int,
+        schedule: Schedule,
+        generator: torch.Generator,
+    ) -> None:
+        super().__init__()
+        table = prediction(recipe.prediction, schedule)
+        self.layout, self.environment_dim = layout, environment_dim
+        self.description = describe(recipe, layout, environment_dim, schedule)
+        self.estimate_tau, self.estimate_output = table.estimate_tau, table.estimate_output
+        self.network = network.to_empty(device="cpu")
+        initialise(self.network, generator)
+        self.register_buffer("environment_mean", torch.zeros(environment_dim))
+        self.register_buffer("environment_scale", torch.ones(environment_dim))
+
+    def standardise_by(self, environment: np.ndarray) -> None:
+        """Scale E by the mean and deviation of a training set's (N, c); what never varies keeps its unit."""
+        deviation = environment.std(axis=0)
+        self.environment_mean.copy_(torch.from_numpy(environment.mean(axis=0)))
+        self.environment_scale.copy_(torch.from_numpy(np.where(deviation > 0, deviation, 1.0)))
+
+    def output(self, tau: Tensor, step: Tensor, environment: Tensor) -> Tensor:
+        """The network's prediction, float32: tau (B, d), step (B,) or (1,), E (B, c) in physical units."""
+        scaled = (environment - self.environment_mean) / self.environment_scale
+        return self.network(tau, step, scaled)
+
+    @torch.inference_mode()
+    def forward(self, tau: Tensor, i: int, environment: Tensor) -> Tensor:
+        """tau0_hat (..., d) from tau (..., d), i in 1..L and E broadcast against tau's leading dimensions.
+
+        Raises:
+            ShapeError: if tau or E has another last dimension than the network was built for.
+        """
+        self._check(tau, environment)
+        E = environment.expand(*tau.shape[:-1], self.environment_dim).reshape(-1, self.environment_dim)
+        flat = tau.reshape(-1, tau.shape[-1])
+        step = torch.full((1,), i, device=tau.device)
+        outputs = [
+            self.output(x.float(), step, e.float()) for x, e in zip(flat.split(CHUNK), E.split(CHUNK), strict=True)
+        ]
+        output = torch.cat(outputs).to(tau.dtype).reshape(tau.shape)
+        return float(self.estimate_tau[i]) * tau + float(self.estimate_output[i]) * output
+
+    def _check(self, tau: Tensor, environment: Tensor) -> None:
+        self.layout.check(tau)
+        if environment.shape[-1] != self.environment_dim:
+            raise ShapeError(
+                f"denoiser: the environment has {environment.shape[-1]} entries; the network was built for "
+                f"{self.environment_dim}; use the task that it was trained on"
+            )
+
+
+def on_meta() -> AbstractContextManager[object]:
+    """Modules built inside draw no initial weights: torch's own drawing would move its global random state."""
+    return torch.device("meta")
+
+
+@torch.no_grad()
+def initialise(network: nn.Module, generator: torch.Generator) -> None:
+    """Weights ~ U(-1, 1) / sqrt(fan in), biases 0, module by module."""
+    for module in network.modules():
+        if isinstance(module, (nn.Linear, nn.Conv2d)):
+            bound = 1 / math.sqrt(module.weight[0].numel())
+            module.weight.uniform_(-bound, bound, generator=generator)
+            if module.bias is not None:
+                module.bias.zero_()

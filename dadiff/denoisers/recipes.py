@@ -1,0 +1,120 @@
+"""The denoisers as components: what `conf/denoiser/*.yaml` names. Light: torch is imported when a network is built."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar, Protocol
+
+from dadiff.denoisers.prediction import PredictionChoice
+from dadiff.diffusion.schedule import Schedule
+from dadiff.errors import ConfigError
+from dadiff.trajectory import Layout
+
+if TYPE_CHECKING:
+    import torch
+
+    from dadiff.denoisers.exact import ExactDenoiser, Law
+    from dadiff.denoisers.learned import NetworkDenoiser
+    from dadiff.trajectory.coordinates import Coordinates
+
+
+class Recipe(Protocol):
+    """A trainable denoiser: a dataclass that builds its network for given sizes."""
+
+    trainable: ClassVar[bool]
+
+    @property
+    def prediction(self) -> PredictionChoice:
+        """What the network predicts."""
+        ...
+
+    def build(
+        self, layout: Layout, environment_dim: int, schedule: Schedule, generator: torch.Generator
+    ) -> NetworkDenoiser:
+        """The untrained denoiser; all its weights are drawn from the generator."""
+        ...
+
+
+def _check_positive(component: str, **sizes: int) -> None:
+    for name, value in sizes.items():
+        if value < 1:
+            raise ConfigError(f"denoiser {component}: {name} is {value}; it must be at least 1")
+
+
+@dataclass(frozen=True)
+class EncoderDecoder:
+    """The paper's network (Section IV-A): three convolutions to a latent vector, three back.
+
+    Args:
+        channels: hidden channels of every convolution.
+        kernel: width of the convolutions in time steps, odd.
+        latent_dim: size of the bottleneck; the paper does not state it.
+        prediction: what the network predicts.
+    """
+
+    trainable: ClassVar[bool] = True
+
+    channels: int = 256
+    kernel: int = 3
+    latent_dim: int = 128
+    prediction: PredictionChoice = "clean"
+
+    def __post_init__(self) -> None:
+        _check_positive("encoder_decoder", channels=self.channels, kernel=self.kernel, latent_dim=self.latent_dim)
+        if self.kernel % 2 == 0:
+            raise ConfigError(f"denoiser encoder_decoder: kernel is {self.kernel}; it must be odd to keep the horizon")
+
+    def build(
+        self, layout: Layout, environment_dim: int, schedule: Schedule, generator: torch.Generator
+    ) -> NetworkDenoiser:
+        """See `Recipe.build`."""
+        from dadiff.denoisers.learned import NetworkDenoiser, on_meta
+        from dadiff.denoisers.networks import EncoderDecoderNetwork
+
+        with on_meta():
+            network = EncoderDecoderNetwork(layout, environment_dim, self.channels, self.kernel, self.latent_dim)
+        return NetworkDenoiser(network, self, layout, environment_dim, schedule, generator)
+
+
+@dataclass(frozen=True)
+class MLP:
+    """Residual blocks on the flat trajectory: fewer operations than the paper's network at like error.
+
+    Args:
+        width: hidden units.
+        blocks: residual blocks of two layers each.
+        prediction: what the network predicts.
+    """
+
+    trainable: ClassVar[bool] = True
+
+    width: int = 512
+    blocks: int = 3
+    prediction: PredictionChoice = "clean"
+
+    def __post_init__(self) -> None:
+        _check_positive("mlp", width=self.width, blocks=self.blocks)
+
+    def build(
+        self, layout: Layout, environment_dim: int, schedule: Schedule, generator: torch.Generator
+    ) -> NetworkDenoiser:
+        """See `Recipe.build`."""
+        from dadiff.denoisers.learned import NetworkDenoiser, on_meta
+        from dadiff.denoisers.networks import ResidualNetwork
+
+        with on_meta():
+            network = ResidualNetwork(layout.size, environment_dim, self.width, self.blocks)
+        return NetworkDenoiser(network, self, layout, environment_dim, schedule, generator)
+
+
+@dataclass(frozen=True)
+class Gaussian:
+    """The exact posterior mean where the law of demonstrations is Gaussian given E. Nothing is trained."""
+
+    trainable: ClassVar[bool] = False
+
+    def exact(self, law: Law, coordinates: Coordinates, schedule: Schedule) -> ExactDenoiser:
+        """The denoiser of one law, in the coordinates in which the sampler works."""
+        from dadiff.denoisers.exact import ExactDenoiser
+
+        return ExactDenoiser(law, coordinates, schedule)

@@ -1,0 +1,59 @@
+"""How a denoiser is trained: the component behind `conf/training/*.yaml`. Light: no torch."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+from dadiff.denoisers.prediction import LossWeight
+from dadiff.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class Training:
+    """Adam on |prediction - target|^2 over uniformly drawn diffusion steps; the result is the weights' running mean.
+
+    Args:
+        steps: gradient steps.
+        batch_size: trajectories a step.
+        learning_rate: its highest value.
+        learning_rate_schedule: `constant`, or `cosine` from the highest value to 0.
+        warmup: steps over which the learning rate rises linearly from 0.
+        ema_decay: of the exponential running mean of the weights; 0 keeps the last weights.
+        loss_weight: of the diffusion steps; `posterior_mean` is the paper's loss.
+        checkpoint_every: steps between two checkpoints.
+        seed: of the initial weights, batches and noise.
+    """
+
+    steps: int = 30_000
+    batch_size: int = 64
+    learning_rate: float = 3e-4
+    learning_rate_schedule: Literal["constant", "cosine"] = "cosine"
+    warmup: int = 200
+    ema_decay: float = 0.999
+    loss_weight: LossWeight = "uniform"
+    checkpoint_every: int = 1000
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "batch_size", "checkpoint_every"):
+            if (value := getattr(self, name)) < 1:
+                raise ConfigError(f"training: {name} is {value}; it must be at least 1")
+        if not (self.learning_rate > 0 and math.isfinite(self.learning_rate)):
+            raise ConfigError(f"training: learning_rate is {self.learning_rate}; it must be positive")
+        if self.warmup < 0 or self.seed < 0:
+            raise ConfigError(f"training: warmup is {self.warmup} and seed {self.seed}; neither may be negative")
+        if not 0 <= self.ema_decay < 1:
+            raise ConfigError(f"training: ema_decay is {self.ema_decay}; it must lie in [0, 1)")
+
+    def learning_rate_at(self, step: int) -> float:
+        """The learning rate of gradient step 0..steps-1."""
+        rate = self.learning_rate * min(1.0, (step + 1) / (self.warmup + 1))
+        if self.learning_rate_schedule == "cosine":
+            rate *= 0.5 * (1 + math.cos(math.pi * step / self.steps))
+        return rate
+
+    def ema_decay_at(self, step: int) -> float:
+        """The decay of the running mean, smaller at first so that the initial weights are soon forgotten."""
+        return min(self.ema_decay, (1 + step) / (10 + step))

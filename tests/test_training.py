@@ -1,0 +1,219 @@
+"""Laws of training: it learns, the seed decides everything, and an interruption changes nothing."""
+
+from __future__ import annotations
+
+import csv
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from dadiff.denoisers import MLP, EncoderDecoder
+from dadiff.denoisers.checkpoints import load
+from dadiff.denoisers.learning import train
+from dadiff.denoisers.recipes import Recipe
+from dadiff.denoisers.training import Training
+from dadiff.diffusion.schedule import paper_linear
+from dadiff.errors import CheckpointError, ConfigError, DataError, ShapeError
+from dadiff.randomness import numpy_generator
+from dadiff.trajectory import Layout
+
+LAYOUT = Layout(state_dim=2, input_dim=1, horizon=4)
+SCHEDULE = paper_linear(num_steps=100, slope=0.01)
+RECIPES = [MLP(width=16, blocks=1), EncoderDecoder(channels=8, latent_dim=4)]
+SHORT = Training(steps=24, batch_size=8, learning_rate=1e-2, warmup=3, ema_decay=0.9, checkpoint_every=7)
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def demonstrations(count: int = 60) -> tuple[np.ndarray, np.ndarray]:
+    """tau is a linear map of E = (3 numbers), with a little noise."""
+    rng = numpy_generator(1, "demonstrations")
+    E = rng.uniform(-1, 1, (count, 3))
+    return E @ rng.standard_normal((3, LAYOUT.size)) + 0.01 * rng.standard_normal((count, LAYOUT.size)), E
+
+
+def run(folder: Path, recipe: Recipe = RECIPES[0], training: Training = SHORT, **options: object):
+    folder.mkdir(exist_ok=True)
+    return train(recipe, LAYOUT, SCHEDULE, training, *demonstrations(), folder, progress=False, **options)
+
+
+def same_weights(one: Path, other: Path) -> bool:
+    a, b = (load_file(folder / "model.safetensors") for folder in (one, other))
+    return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
+
+
+class Interrupt:
+    """An augmentation that changes nothing, and presses Ctrl-C in the midst of one gradient step."""
+
+    def __init__(self, at: int) -> None:
+        self.calls, self.at = 0, at
+
+    def __call__(self, E: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+        self.calls += 1
+        if self.calls == self.at:
+            signal.raise_signal(signal.SIGINT)
+        return E
+
+
+class Killed(Exception):
+    """Stands for a death without notice."""
+
+
+def kill_at(step: int):
+    calls = iter(range(1, step + 1))
+
+    def augment(E: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+        if next(calls) == step:
+            raise Killed
+        return E
+
+    return augment
+
+
+@pytest.mark.parametrize("recipe", RECIPES)
+@pytest.mark.parametrize("at", [1, 5, 7, 20])
+def test_an_interrupted_training_resumes_bit_for_bit(recipe, at, tmp_path):
+    run(tmp_path / "whole", recipe)
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path / "parts", recipe, augment=Interrupt(at))
+    assert int(load_file(tmp_path / "parts/checkpoint.safetensors")["step"]) == at
+    run(tmp_path / "parts", recipe)
+    assert same_weights(tmp_path / "whole", tmp_path / "parts")
+
+
+@pytest.mark.parametrize("loss_weight", ["uniform", "posterior_mean"])
+def test_a_killed_training_resumes_from_its_last_checkpoint(loss_weight, tmp_path):
+    training = replace(SHORT, loss_weight=loss_weight)
+    run(tmp_path / "whole", training=training)
+    with pytest.raises(Killed):
+        run(tmp_path / "parts", training=training, augment=kill_at(18))
+    assert int(load_file(tmp_path / "parts/checkpoint.safetensors")["step"]) == 14
+    run(tmp_path / "parts", training=training)
+    assert same_weights(tmp_path / "whole", tmp_path / "parts")
+    losses = [[row["loss"] for row in read_curve(tmp_path / name)] for name in ("whole", "parts")]
+    assert losses[0] == losses[1]
+
+
+def test_augmentation_resumes_too(tmp_path):
+    def shuffle(E: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+        return E[:, torch.randperm(E.shape[1], generator=generator)]
+
+    def shuffle_then(stop):
+        return lambda E, generator: stop(shuffle(E, generator), generator)
+
+    run(tmp_path / "plain")
+    run(tmp_path / "whole", augment=shuffle)
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path / "parts", augment=shuffle_then(Interrupt(11)))
+    run(tmp_path / "parts", augment=shuffle)
+    assert same_weights(tmp_path / "whole", tmp_path / "parts")
+    assert not same_weights(tmp_path / "whole", tmp_path / "plain")
+
+
+def test_the_signal_handler_is_given_back(tmp_path):
+    before = signal.getsignal(signal.SIGINT)
+    run(tmp_path / "a")
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path / "b", augment=Interrupt(2))
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+@pytest.mark.parametrize("recipe", RECIPES)
+def test_the_seed_decides_and_the_global_state_does_not(recipe, tmp_path):
+    before = torch.get_rng_state()
+    run(tmp_path / "one", recipe)
+    assert torch.equal(before, torch.get_rng_state())
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(77)
+        run(tmp_path / "same", recipe)
+    run(tmp_path / "other", recipe, replace(SHORT, seed=1))
+    assert same_weights(tmp_path / "one", tmp_path / "same")
+    assert not same_weights(tmp_path / "one", tmp_path / "other")
+
+
+def read_curve(folder: Path) -> list[dict[str, str]]:
+    with (folder / "training.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def test_what_is_left_in_the_folder(tmp_path):
+    denoiser = run(tmp_path / "a")
+    assert sorted(path.name for path in (tmp_path / "a").iterdir()) == ["model.safetensors", "training.csv"]
+    loaded = load(tmp_path / "a/model.safetensors", RECIPES[0], LAYOUT, 3, SCHEDULE)
+    tau, E = torch.ones(LAYOUT.size, dtype=torch.float64), torch.ones(3, dtype=torch.float64)
+    assert torch.equal(loaded(tau, 5, E), denoiser(tau, 5, E))
+    rows = read_curve(tmp_path / "a")
+    assert len(rows) == SHORT.steps and int(rows[-1]["step"]) == SHORT.steps
+    assert float(rows[-1]["seconds"]) > 0
+
+
+@pytest.mark.parametrize("recipe", [MLP(width=64, blocks=1), EncoderDecoder(channels=16, latent_dim=16)])
+@pytest.mark.parametrize("choice", ["clean", "velocity"])
+def test_training_learns(recipe, choice, tmp_path):
+    """At a step that holds no signal the clean estimate becomes the mean given E."""
+    recipe = replace(recipe, prediction=choice)
+    denoiser = run(tmp_path / "a", recipe, Training(steps=500, batch_size=64, learning_rate=3e-3, warmup=20))
+    trajectories, E = (torch.from_numpy(array) for array in demonstrations())
+    error = denoiser(torch.zeros_like(trajectories), 90, E) - trajectories
+    assert error.square().mean() < 0.05 * trajectories.var()
+
+
+def test_a_checkpoint_of_another_training_is_refused(tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path / "a", augment=Interrupt(3))
+    with pytest.raises(CheckpointError, match=r"learning_rate = 0\.01 \(expected 0\.02\)"):
+        run(tmp_path / "a", training=replace(SHORT, learning_rate=0.02))
+    trajectories, E = demonstrations()
+    with pytest.raises(CheckpointError, match=r"data = "):
+        train(RECIPES[0], LAYOUT, SCHEDULE, SHORT, trajectories + 1, E, tmp_path / "a", progress=False)
+
+
+def test_a_truncated_checkpoint_is_refused(tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path / "a", augment=Interrupt(3))
+    path = tmp_path / "a/checkpoint.safetensors"
+    path.write_bytes(path.read_bytes()[:-10])
+    with pytest.raises(CheckpointError, match="checkpoint.safetensors.*truncated"):
+        run(tmp_path / "a")
+
+
+def test_bad_data_is_named(tmp_path):
+    trajectories, E = demonstrations()
+    arguments = (RECIPES[0], LAYOUT, SCHEDULE, SHORT)
+    with pytest.raises(ShapeError, match="trajectory has 13 entries"):
+        train(*arguments, trajectories[:, :-1], E, tmp_path, progress=False)
+    with pytest.raises(ShapeError, match=r"environments \(59, 3\)"):
+        train(*arguments, trajectories, E[1:], tmp_path, progress=False)
+    with pytest.raises(DataError, match="environments hold values that are not finite"):
+        train(*arguments, trajectories, np.where(E > 0.9, np.nan, E), tmp_path, progress=False)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("fields", "text"), [
+    ({"steps": 0}, "steps is 0"),
+    ({"learning_rate": 0.0}, "learning_rate is 0"),
+    ({"ema_decay": 1.0}, "ema_decay is 1"),
+    ({"warmup": -1}, "warmup is -1"),
+])  # fmt: skip
+def test_impossible_training(fields, text):
+    with pytest.raises(ConfigError, match=text):
+        Training(**fields)
+
+
+def test_learning_rate_schedules():
+    training = Training(steps=1000, learning_rate=1.0, warmup=99)
+    rates = [training.learning_rate_at(step) for step in range(1000)]
+    assert np.argmax(rates) == 99 and 0 < rates[0] <= 0.01 and rates[-1] < 1e-5
+    constant = replace(training, learning_rate_schedule="constant")
+    assert constant.learning_rate_at(99) == constant.learning_rate_at(999) == 1
