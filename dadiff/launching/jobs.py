@@ -1,0 +1,81 @@
+"""What a job does: train, or run one cell, and mirror it into MLflow. Every launcher and the single run use these."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+from dadiff.config import build
+from dadiff.errors import DadiffError
+from dadiff.identity import identify
+from dadiff.launching.outcome import why
+from dadiff.store import Cache, Results, StoredRun
+from dadiff.tracking import Tracking
+
+if TYPE_CHECKING:
+    from dadiff.identity import Artefact
+
+
+def tracking_of(config: Mapping[str, Any]) -> Tracking:
+    """The tracking component of a resolved configuration.
+
+    Raises:
+        ConfigError: if it is not valid.
+    """
+    return build(config["tracking"], "tracking")
+
+
+def run(config: Mapping[str, Any]) -> StoredRun:
+    """Run one resolved configuration and mirror it into MLflow; what is done already is only mirrored."""
+    from dadiff.experiment import execute
+
+    tracking, identity = tracking_of(config), identify(config)
+    if identity.denoiser is not None:
+        train(config)
+    if Results(config["output_dir"]).is_done(identity.key) and not config.get("force"):
+        stored, run_id = execute(config), None
+    else:
+        run_id = tracking.start(identity.key, identity.name, config["output_dir"])
+        with _closing(tracking, run_id):
+            stored = execute(config)
+    tracking.log_run(stored, run_id)
+    return stored
+
+
+def train(config: Mapping[str, Any]) -> None:
+    """Build the trained denoiser, unless it is cached, and mirror its training into MLflow."""
+    from dadiff.experiment import prepare
+
+    tracking, artefact = tracking_of(config), _denoiser(config)
+    cache = Cache(config["output_dir"])
+    run_id = None
+    if not cache.contains("denoiser", artefact.key) and not cache.is_building("denoiser", artefact.key):
+        run_id = tracking.start(artefact.key, f"training/{artefact.key}", config["output_dir"], "training")
+    with _closing(tracking, run_id):
+        prepare(config)
+    tracking.log_training(cache.folder("denoiser", artefact.key), run_id)
+
+
+def build_dataset(config: Mapping[str, Any]) -> None:
+    """Build the data set, unless it is cached."""
+    from dadiff.assembly import Experiment
+
+    _ = Experiment.of(config).data
+
+
+def _denoiser(config: Mapping[str, Any]) -> Artefact:
+    artefact = identify(config).denoiser
+    if artefact is None:
+        raise DadiffError("denoiser: this one is exact, there is nothing to train")
+    return artefact
+
+
+@contextmanager
+def _closing(tracking: Tracking, run_id: str | None) -> Iterator[None]:
+    """Close the MLflow run if the work raises; if its process is killed, the next start closes it."""
+    try:
+        yield
+    except BaseException as error:
+        tracking.stop(run_id, *why(error))
+        raise

@@ -1,0 +1,31 @@
+"""How a job ended, and why."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from dadiff.errors import DadiffError
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The end of a job.
+
+    Args:
+        status: "finished", "failed", "killed", "timeout" or "out_of_memory".
+    """
+
+    status: str
+    reason: str | None
+    seconds: float
+
+
+def why(error: BaseException) -> tuple[str, str]:
+    """The status and reason that an exception stands for."""
+    reason = " ".join(str(error).split())
+    if isinstance(error, KeyboardInterrupt):
+        return "interrupted", "interrupted"
+    out_of_memory = isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError"
+    if out_of_memory or "can't allocate memory" in reason:
+        return "out_of_memory", f"out of memory: {reason or type(error).__name__}"
+    return "failed", reason if isinstance(error, DadiffError) else f"{type(error).__name__}: {reason}"

@@ -1,0 +1,125 @@
+"""What a multirun has to do: its cells, each key once, what is done already, and what must be built first.
+
+Free of torch, so that `dry_run=true` answers at once.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from dadiff.identity import Artefact, Identity, identify
+from dadiff.store import Cache, Cell, Results
+
+
+@dataclass(frozen=True)
+class PlannedCell:
+    """One key of the sweep.
+
+    Args:
+        config: the resolved configuration of the first cell with this key.
+        copies: how many cells of the sweep resolve to this key.
+        status: what is stored under the key, if anything.
+    """
+
+    config: dict[str, Any]
+    identity: Identity
+    copies: int
+    status: str | None
+    is_done: bool
+
+    def cell(self) -> Cell:
+        """As a sweep's record names it."""
+        return Cell(self.identity.key, self.identity.name, self.identity.axes, self.status or "waiting")
+
+
+@dataclass(frozen=True)
+class Preparation:
+    """Something that cells share and that is not in the cache yet.
+
+    Args:
+        config: of a cell that needs it.
+        needs: keys of the preparations that come before it.
+    """
+
+    artefact: Artefact
+    config: dict[str, Any]
+    needs: frozenset[str]
+
+    @property
+    def name(self) -> str:
+        """For people."""
+        return f"{'train' if self.artefact.kind == 'denoiser' else 'build'} {self.artefact.kind} {self.artefact.key}"
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The cells of a multirun in their order, and the preparations, shared ones first."""
+
+    cells: Sequence[PlannedCell]
+    preparations: Sequence[Preparation]
+
+    @property
+    def waiting(self) -> list[PlannedCell]:
+        """The cells that are still to be run."""
+        return [cell for cell in self.cells if not cell.is_done]
+
+    def needs(self, cell: PlannedCell) -> frozenset[str]:
+        """Keys of the preparations that must end before this cell starts."""
+        return frozenset(p.artefact.key for p in self.preparations) & _keys(cell.identity)
+
+
+def make_plan(configs: Sequence[Mapping[str, Any]]) -> Plan:
+    """The plan for resolved configurations, one a cell of the sweep.
+
+    Raises:
+        ConfigError: if a configuration is not valid.
+        StoreError: if what is stored cannot be read.
+    """
+    identities = [identify(config) for config in configs]
+    copies = Counter(identity.key for identity in identities)
+    first = {identity.key: (dict(config), identity) for config, identity in reversed([*zip(configs, identities)])}
+    cells = [_planned(*first[key], copies[key]) for key in copies]
+    return Plan(cells, _preparations([cell for cell in cells if not cell.is_done]))
+
+
+def _planned(config: dict[str, Any], identity: Identity, copies: int) -> PlannedCell:
+    results = Results(config["output_dir"])
+    is_done = results.is_done(identity.key) and not config.get("force")
+    return PlannedCell(config, identity, copies, results.status(identity.key), is_done)
+
+
+def _preparations(cells: Sequence[PlannedCell]) -> list[Preparation]:
+    """Data sets before trainings; each once, with the configuration of the first cell that needs it."""
+    found: dict[str, Preparation] = {}
+    for kind in ("dataset", "denoiser"):
+        for cell in cells:
+            artefact = getattr(cell.identity, kind)
+            if artefact and not Cache(cell.config["output_dir"]).contains(kind, artefact.key):
+                before = frozenset(found) & {cell.identity.dataset.key} - {artefact.key}
+                found.setdefault(artefact.key, Preparation(artefact, cell.config, before))
+    return list(found.values())
+
+
+def _keys(identity: Identity) -> set[str]:
+    return {artefact.key for artefact in (identity.dataset, identity.denoiser) if artefact}
+
+
+def describe(plan: Plan) -> str:
+    """The plan for people: cells with their keys and state, what they share, what would be built."""
+    lines = [f"{len(plan.cells)} cells, {len(plan.cells) - len(plan.waiting)} done, {len(plan.waiting)} to run"]
+    lines += [f"  {cell.identity.key}  {_state(cell):<8}  {cell.identity.name}{_copies(cell)}" for cell in plan.cells]
+    trainings = Counter(cell.identity.denoiser.key for cell in plan.cells if cell.identity.denoiser)
+    lines += [f"denoiser {key} is shared by {count} cells" for key, count in trainings.items() if count > 1]
+    lines += [f"would {preparation.name}" for preparation in plan.preparations]
+    return "\n".join(lines)
+
+
+def _state(cell: PlannedCell) -> str:
+    return "done" if cell.is_done else f"{cell.status}, to run" if cell.status else "to run"
+
+
+def _copies(cell: PlannedCell) -> str:
+    return f"  ({cell.copies} cells of the sweep)" if cell.copies > 1 else ""

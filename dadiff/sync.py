@@ -1,0 +1,62 @@
+"""`dadiff-sync`: upload to MLflow what is on disk and not there yet, for example because its server was away."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+from dadiff.errors import DadiffError
+from dadiff.launching.jobs import tracking_of
+from dadiff.store import DONE, Cache, Results, StoredRun
+from dadiff.tracking import is_tracked
+
+
+def sync(output_dir: Path, uri: str | None = None) -> tuple[int, int]:
+    """Upload stored runs, and the trainings that they were made with. Returns (uploaded, still missing).
+
+    Args:
+        uri: the store; None takes for each run the one that it was configured with.
+
+    Raises:
+        StoreError: if a store is away.
+    """
+    before = after = 0
+    runs = [run for run in Results(output_dir) if run.status in DONE and run.record["config"]["tracking"]["enabled"]]
+    for run in runs:
+        wanted = uri or tracking_of(run.record["config"]).uri
+        before += is_tracked(run.folder, wanted)
+        _upload(output_dir, run, uri)
+        after += is_tracked(run.folder, wanted)
+    return after - before, len(runs) - after
+
+
+def _upload(output_dir: Path, run: StoredRun, uri: str | None) -> None:
+    tracking = tracking_of(run.record["config"])
+    if uri is not None:
+        tracking = replace(tracking, uri=uri, parent=None)
+    if is_tracked(run.folder, tracking.uri):
+        return
+    tracking.prepare()
+    denoiser = run.record["links"].get("denoiser")
+    if denoiser and Cache(output_dir).contains("denoiser", denoiser):
+        tracking.log_training(Cache(output_dir).folder("denoiser", denoiser))
+    tracking.log_run(run)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The command line; returns its exit code, 1 if something could not be uploaded."""
+    parser = argparse.ArgumentParser("dadiff-sync", description="Upload stored results that MLflow does not have yet.")
+    parser.add_argument("--output-dir", type=Path, default=Path("outputs"), help="where results lie (outputs)")
+    parser.add_argument("--uri", help="the MLflow store (that of each run's configuration)")
+    given = parser.parse_args(arguments)
+    logging.basicConfig(level=logging.WARNING, format="%(message)s")
+    try:
+        uploaded, missing = sync(given.output_dir, given.uri)
+    except DadiffError as error:
+        print(f"dadiff-sync: {error}", file=sys.stderr)
+        return 1
+    print(f"{uploaded} runs uploaded, {missing} still missing")
+    return int(missing > 0)

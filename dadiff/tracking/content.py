@@ -1,0 +1,171 @@
+"""What of a stored run, training or sweep goes into MLflow, as plain values. Nothing here talks to MLflow."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from dadiff.store import Results, StoredRun, Sweep
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+INDICES = ("robot", "case", "sample", "t")
+ALONG_TIME = "along_time/"
+ARTIFACTS = (".json", ".yaml", ".parquet", ".png", ".svg", ".pdf")
+
+
+@dataclass(frozen=True)
+class Content:
+    """What is logged of one run.
+
+    Args:
+        metrics: (name, value, step), finite values only.
+        time: of all metrics, in ms since 1970; taken from the record so that logging again changes nothing.
+    """
+
+    params: dict[str, str] = field(default_factory=dict)
+    metrics: list[tuple[str, float, int]] = field(default_factory=list)
+    tags: dict[str, str] = field(default_factory=dict)
+    files: list[Path] = field(default_factory=list)
+    time: int = 0
+
+
+def run_content(run: StoredRun) -> Content:
+    """Axes as parameters, headline scalars, error curves with step = t, and what identifies the run."""
+    provenance = run.record.get("provenance", {})
+    versions = provenance.get("versions", {})
+    links = {kind: key for kind, key in run.record.get("links", {}).items() if key}
+    tags = {
+        "status": run.status,
+        **{f"version.{name}": str(version) for name, version in versions.items()},
+        **{f"link.{kind}": key for kind, key in links.items()},
+        **{name: str(provenance[name]) for name in ("device", "commit") if provenance.get(name)},
+        "mlflow.note.content": run_note(run),
+    }
+    if provenance.get("commit"):
+        tags["mlflow.source.git.commit"] = str(provenance["commit"])
+    params = {name: _text(value) for name, value in run.axes.items()}
+    return Content(params, scalars(run) + curves(run), tags, artifacts(run.folder), end_time(provenance))
+
+
+def scalars(run: StoredRun) -> list[tuple[str, float, int]]:
+    """The headline scalars, and the step at which a run diverged."""
+    values = dict(run.metrics)
+    if run.record.get("diverged_step") is not None:
+        values["diverged_step"] = float(run.record["diverged_step"])
+    return [(name, value, 0) for name, value in values.items() if math.isfinite(value)]
+
+
+def curves(run: StoredRun) -> list[tuple[str, float, int]]:
+    """Means over robots, cases and samples at each t."""
+    return _columns(run.table("per_step"), ALONG_TIME) if run.has("per_step") else []
+
+
+def _columns(table: pd.DataFrame, prefix: str) -> list[tuple[str, float, int]]:
+    quantities = [name for name in table.columns if name not in INDICES]
+    means = table.groupby("t")[quantities].mean()
+    return [
+        (f"{prefix}{name}", float(value), int(t))
+        for name in quantities
+        for t, value in means[name].items()
+        if math.isfinite(value)
+    ]
+
+
+def run_note(run: StoredRun) -> str:
+    """The run in a few sentences of markdown."""
+    counts = ", ".join(f"{count} {what}" for what, count in run.record.get("counts", {}).items() if count)
+    lines = [f"**{run.name}**: {run.status}" + (f" ({run.record['reason']})" if run.record.get("reason") else "") + "."]
+    if counts:
+        lines.append(f"Headline metrics are means over {counts} and over time; `{ALONG_TIME}…` are means at each t.")
+    if run.axes:
+        lines.append("\n".join(["| parameter | value |", "|---|---|", *_rows(run.axes)]))
+    lines.append(f"Tables and the resolved configuration are among the artifacts and in `{run.folder}`.")
+    return "\n\n".join(lines)
+
+
+def training_content(manifest: dict[str, Any], folder: Path) -> Content:
+    """A cached training: its identity as parameters, its history (column `step` beside the losses) as metrics."""
+    import pandas as pd
+
+    identity = flat(manifest.get("identity", {}))
+    path = folder / "history.parquet"
+    metrics = []
+    if path.is_file():
+        history = pd.read_parquet(path).set_index("step")
+        metrics = [
+            (name, float(value), int(step))
+            for name in history.columns
+            for step, value in history[name].items()
+            if math.isfinite(value)
+        ]
+    note = f"Training of the denoiser `{manifest['key']}`, shared by every run whose tag `link.denoiser` names it."
+    tags = {"status": "finished", "mlflow.note.content": f"{note}\n\nThe weights lie in `{folder}`."}
+    params = {name: _text(value) for name, value in identity.items()}
+    return Content(params, metrics, tags, artifacts(folder), end_time({"started": manifest.get("created")}))
+
+
+def sweep_content(sweep: Sweep, table_file: Path) -> Content:
+    """A sweep: what it ranges over as parameters, how many cells ended how, its table of results."""
+    statuses = [cell.status for cell in sweep.cells]
+    counts = {f"cells_{status}": float(statuses.count(status)) for status in sorted(set(statuses))}
+    failed = [f"- {cell.name}: {cell.status}, {cell.reason}" for cell in sweep.cells if cell.reason]
+    note = [
+        f"**{sweep.name}**: {len(sweep.cells)} cells. Run or resume it with",
+        f"```\n{sweep.command}\n```",
+        "`results.csv` among the artifacts has one row a cell.",
+        *(["Not finished:\n" + "\n".join(failed)] if failed else []),
+    ]
+    tags = {"mlflow.note.content": "\n\n".join(note), "kind": "sweep"}
+    metrics = [(name, value, 0) for name, value in counts.items()]
+    return Content({name: _text(value) for name, value in sweep.definition.items()}, metrics, tags, [table_file])
+
+
+def results_table(sweep: Sweep, results: Results) -> pd.DataFrame:
+    """One row a cell: name, status, axes, headline metrics, key."""
+    import pandas as pd
+
+    rows = []
+    for cell in sweep.cells:
+        metrics = results.read(cell.key).metrics if results.is_done(cell.key) else {}
+        rows.append({"name": cell.name, "status": cell.status, **cell.axes, **metrics, "key": cell.key})
+    return pd.DataFrame(rows)
+
+
+def artifacts(folder: Path) -> list[Path]:
+    """The files worth having in MLflow: tables, figures and descriptions, not weights and arrays."""
+    return sorted(p for p in folder.iterdir() if p.suffix in ARTIFACTS and p.name != "tracking.json")
+
+
+def flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """A nested mapping with dotted names."""
+    parts: dict[str, Any] = {}
+    for name, value in values.items():
+        parts |= flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
+    return parts
+
+
+def end_time(provenance: dict[str, Any]) -> int:
+    """When the work ended, in ms since 1970; 0 where that is not recorded."""
+    if not provenance.get("started"):
+        return 0
+    started = datetime.fromisoformat(provenance["started"]).timestamp()
+    return int(1000 * (started + float(provenance.get("seconds") or 0)))
+
+
+def chunks(items: Sequence[Any], size: int) -> list[Sequence[Any]]:
+    """Pieces of at most `size` items."""
+    return [items[first : first + size] for first in range(0, len(items), size)]
+
+
+def _rows(values: dict[str, Any]) -> list[str]:
+    return [f"| {name} | {_text(value)} |" for name, value in values.items()]
+
+
+def _text(value: Any) -> str:
+    return str(value)[:500]
