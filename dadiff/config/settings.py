@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
-from dadiff.config.build import TARGET, build, check, completed
+from dadiff.config.build import TARGET, build, check, completed, resolve
 from dadiff.errors import ConfigError
 
 GROUPS = (
@@ -74,17 +74,17 @@ def settings_of(config: Mapping[str, Any]) -> Settings:
 
 
 def assemble(config: Mapping[str, Any], choices: Mapping[str, str] | None = None) -> Parts:
-    """Build every component of a resolved configuration.
+    """Build every component of a resolved configuration, after all of it is checked.
 
     Args:
         config: nested plain mapping.
         choices: group -> name of the preset, so that messages can name the file.
     """
     settings = settings_of(config)
-    components = {
-        group: build(_node(config, group), where(group, choices), settings.components) for group in GROUPS
-    }
-    return Parts(settings, components)
+    nodes = {group: (_node(config, group), where(group, choices)) for group in GROUPS}
+    for node, place in nodes.values():
+        check(node, resolve(node, place, settings.components), place)
+    return Parts(settings, {group: build(node, place, settings.components) for group, (node, place) in nodes.items()})
 
 
 def complete(config: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,0 +1,75 @@
+"""The command line `dadiff`: a Hydra application whose jobs are runs.
+
+Heavy packages are imported when a run begins, so that help and configuration errors answer at once.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+
+from dadiff.config.composed import plain
+from dadiff.errors import DadiffError
+from dadiff.folders import shipped
+
+log = logging.getLogger("dadiff")
+
+
+def one_run(config: dict[str, Any]) -> None:
+    """Execute one resolved configuration, track it, and print its table."""
+    from dadiff.config import assemble
+    from dadiff.identity import identify
+
+    parts = assemble(config, config["choices"])
+    identity = identify(config, parts)
+    if parts.settings.dry_run:
+        print(f"{identity.key}  {identity.name}")
+        return
+    parts["tracking"].prepare()
+
+    from dadiff.experiment import execute
+    from dadiff.summary import summary
+
+    run = execute(config)
+    parts["tracking"].log_run(run)
+    if run.record["links"].get("denoiser"):
+        from dadiff.store import Cache
+
+        parts["tracking"].log_training(Cache(parts.settings.output_dir).folder("denoiser", identity.denoiser.key))
+    print(summary([run]))
+    print(f"stored in {run.folder}")
+
+
+@hydra.main(version_base="1.3", config_path=str(shipped("conf").absolute()), config_name="config")
+def _application(config: DictConfig) -> None:
+    reported(lambda: one_run(plain(config, HydraConfig.get().runtime.choices)))
+
+
+def reported(work: Callable[[], None]) -> None:
+    """Do the work; an error that the user can mend becomes one line and exit code 1."""
+    try:
+        work()
+    except DadiffError as error:
+        print(f"dadiff: error: {error}", file=sys.stderr)
+        raise SystemExit(1) from error
+
+
+def main() -> None:
+    """Entry point."""
+    # from dadiff.launching import register
+
+    os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # spinning threads slow each other on a busy machine
+    # register()
+    reported(_application)
+
+
+if __name__ == "__main__":
+    main()
