@@ -123,7 +123,8 @@ def test_a_run_comes_back_as_it_was_stored(tmp_path):
         arrays={"states": np.ones((2, 3))},
     )
     (run,) = results
-    assert math.isnan(run.metrics["gap"]) and run.metrics["rank"] == 64
+    assert math.isnan(run.metrics["gap"])
+    assert run.metrics["rank"] == 64
     pd.testing.assert_frame_equal(run.table("per_step"), table)
     assert run.arrays()["states"].shape == (2, 3)
     assert json.loads((run.folder / "run.json").read_text())["metrics"]["gap"] is None
@@ -134,7 +135,8 @@ def test_a_run_comes_back_as_it_was_stored(tmp_path):
 def test_failures_give_way_to_results_and_not_the_other_way(tmp_path):
     results = Results(tmp_path)
     results.write_failure(record(), "killed", "SIGKILL")
-    assert results.status(KEY) == "killed" and not results.is_done(KEY)
+    assert results.status(KEY) == "killed"
+    assert not results.is_done(KEY)
     results.write(record())
     assert results.is_done(KEY)
     results.write_failure(record(), "failed", "later")
@@ -146,7 +148,7 @@ def test_a_newer_format_is_refused(tmp_path):
     run = Results(tmp_path).write(record())
     path = run.folder / "run.json"
     path.write_text(path.read_text().replace('"format": 1', '"format": 2'))
-    with pytest.raises(StoreError, match="format 2.*update dadiff"):
+    with pytest.raises(StoreError, match=r"format 2.*update dadiff"):
         Results(tmp_path).read(KEY)
     path.write_text("{")
     with pytest.raises(DataError, match="damaged"):
@@ -194,7 +196,8 @@ def test_the_cache_tool_lists_verifies_and_prunes(tmp_path, capsys):
     arguments = ["--output-dir", str(tmp_path)]
     assert dadiff_cache(["list", *arguments]) == 0
     listed = capsys.readouterr().out
-    assert KEY in listed and "whole     1" in listed
+    assert KEY in listed
+    assert "whole     1" in listed
     assert dadiff_cache(["prune", *arguments, "--dry-run"]) == 0
     assert "would remove denoiser" in capsys.readouterr().out
     assert dadiff_cache(["prune", *arguments]) == 0

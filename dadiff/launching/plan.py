@@ -80,7 +80,9 @@ def make_plan(configs: Sequence[Mapping[str, Any]]) -> Plan:
     """
     identities = [identify(config) for config in configs]
     copies = Counter(identity.key for identity in identities)
-    first = {identity.key: (dict(config), identity) for config, identity in reversed([*zip(configs, identities)])}
+    first: dict[str, tuple[dict[str, Any], Identity]] = {}
+    for config, identity in zip(configs, identities, strict=True):
+        first.setdefault(identity.key, (dict(config), identity))
     cells = [_planned(*first[key], copies[key]) for key in copies]
     return Plan(cells, _preparations([cell for cell in cells if not cell.is_done]))
 

@@ -24,7 +24,14 @@ from dadiff.launching.sweep import SweepRun, summary
 from dadiff.launching.table import Table
 from dadiff.store import DONE
 
-PRELOAD = ("dadiff.cli", "dadiff.experiment", "mlflow", "control", "pandas")
+PRELOAD = (
+    "dadiff.cli",
+    "dadiff.experiment",
+    "mlflow.store.tracking.sqlalchemy_store",
+    "mlflow.tracking.client",
+    "control",
+    "pyarrow.parquet",
+)
 
 
 class ProcessesLauncher(Launcher):

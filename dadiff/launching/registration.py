@@ -29,6 +29,10 @@ def register() -> None:
 
     from dadiff.launching.processes import ProcessesLauncher
 
-    Plugins.is_in_toplevel_plugins_module = staticmethod(lambda name: name.startswith(PLUGINS))  # type: ignore[method-assign]
+    Plugins.is_in_toplevel_plugins_module = staticmethod(_is_plugin)  # type: ignore[assignment]
     Plugins.instance().register(ProcessesLauncher)
     ConfigStore.instance().store(group="hydra/launcher", name="processes_schema", node=ProcessesSchema)
+
+
+def _is_plugin(name: str) -> bool:
+    return name.startswith(PLUGINS)

@@ -170,7 +170,7 @@ class Results:
         for name, table in (tables or {}).items():
             table.to_parquet(work / f"{name}.parquet", index=False)
         if arrays:
-            np.savez(work / "examples.npz", **arrays)
+            np.savez(work / "examples.npz", **dict(arrays))  # type: ignore[arg-type]
         if config_text:
             (work / "config.yaml").write_text(config_text)
         write_json(work / RECORD, dict(record))

@@ -112,11 +112,11 @@ def _lock_file(uri: str) -> Path:
 
 
 def failures() -> tuple[type[Exception], ...]:
-    """What MLflow raises when its store is away or refuses."""
+    """What comes up when MLflow's store is away or refuses."""
     from mlflow.exceptions import MlflowException
     from sqlalchemy.exc import SQLAlchemyError
 
-    return (MlflowException, SQLAlchemyError, OSError)
+    return (MlflowException, SQLAlchemyError, OSError, StoreError)
 
 
 @contextmanager
@@ -139,7 +139,7 @@ def spared(what: str) -> Iterator[None]:
     """Turn what MLflow raises into a warning: what was computed is on disk and is uploaded later."""
     try:
         yield
-    except (*failures(), StoreError) as error:
+    except failures() as error:
         log.warning("MLflow did not take %s (%s); it is on disk, dadiff-sync uploads it", what, first_line(error))
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from dadiff.store.files import read_json, write_json
 
@@ -34,5 +35,5 @@ def write_marker(folder: Path, uri: str, marker: Marker) -> None:
     write_json(folder / MARKER, {"stores": {**_read(folder), uri: vars(marker)}})
 
 
-def _read(folder: Path) -> dict[str, dict[str, object]]:
+def _read(folder: Path) -> dict[str, dict[str, Any]]:
     return read_json(folder / MARKER)["stores"] if (folder / MARKER).is_file() else {}

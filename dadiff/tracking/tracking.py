@@ -208,12 +208,14 @@ class Tracking:
         self._client.log_batch(run_id, tags=[RunTag(name, value) for name, value in tags.items()])
 
     def _search(self, condition: str) -> list[Run]:
-        found, token = [], None
-        while True:
-            page = self._client.search_runs([self._experiment_id], condition, page_token=token)
-            found, token = [*found, *page], page.token
-            if not token:
-                return found
+        found: list[Run] = []
+        page = self._client.search_runs([self._experiment_id], condition)
+        while page:
+            found += page
+            page = (
+                self._client.search_runs([self._experiment_id], condition, page_token=page.token) if page.token else []
+            )
+        return found
 
     def _is_gone(self, run_id: str) -> bool:
         from mlflow.exceptions import MlflowException

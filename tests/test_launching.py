@@ -1,0 +1,178 @@
+"""Laws of launching: no job harms another, each way to die has its reason, what waits holds no worker."""
+
+from __future__ import annotations
+
+import io
+import os
+import signal
+import time
+from pathlib import Path
+
+import pytest
+
+from dadiff.errors import ConfigError, DataError
+from dadiff.launching.outcome import why
+from dadiff.launching.pool import Pool, Work, cores
+from dadiff.launching.table import Table, clock, last_line
+
+
+def write(path: Path, text: str, seconds: float = 0.0) -> None:
+    time.sleep(seconds)
+    with path.open("a") as stream:
+        stream.write(text + "\n")
+
+
+def fail(kind: str) -> None:
+    os.write(1, b"about to fail\n")
+    if kind == "error":
+        raise DataError("states.npz: row 3 is nan")
+    if kind == "bug":
+        raise ZeroDivisionError("division by zero")
+    if kind == "memory":
+        raise MemoryError
+    if kind == "exit":
+        os._exit(7)
+    if kind == "kill":
+        os.kill(os.getpid(), signal.SIGKILL)
+    if kind == "crash":
+        os.kill(os.getpid(), signal.SIGSEGV)
+    time.sleep(60)
+
+
+def multiply(path: Path) -> None:
+    """Multiplies in every thread that torch has: would hang if the server had threads when it forked."""
+    import torch
+
+    size = float((torch.ones(400, 400) @ torch.ones(400, 400)).sum())
+    path.write_text(f"{size:.0f} {torch.get_num_threads()} {os.environ['OMP_NUM_THREADS']}")
+
+
+class Silent:
+    def __init__(self) -> None:
+        self.order: list[str] = []
+        self.most = 0
+
+    def ended(self, work, outcome) -> None:
+        self.order.append(work.key)
+
+    def tick(self, running) -> None:
+        self.most = max(self.most, len(running))
+
+
+def work(root: Path, key: str, function, *arguments, needs=()) -> Work:
+    return Work(key, key, function, arguments, root / "logs" / f"{key}.log", frozenset(needs))
+
+
+@pytest.fixture(scope="module")
+def pool():
+    return Pool(workers=4, time_limit=3.0, preload=["torch"])
+
+
+def test_every_way_to_end_has_its_status_and_reason_and_harms_no_other(pool, tmp_path):
+    kinds = ["error", "bug", "memory", "exit", "kill", "crash", "sleep"]
+    works = [work(tmp_path, kind, fail, kind) for kind in kinds]
+    works += [work(tmp_path, f"fine{i}", write, tmp_path / "out", "x") for i in range(3)]
+    outcomes = pool.run(works, Silent())
+    expected = {
+        "error": ("failed", "states.npz: row 3 is nan"),
+        "bug": ("failed", "ZeroDivisionError: division by zero"),
+        "memory": ("out_of_memory", "out of memory"),
+        "exit": ("failed", "exited with code 7"),
+        "kill": ("killed", "killed by SIGKILL, perhaps because memory ran out"),
+        "crash": ("killed", "killed by SIGSEGV"),
+        "sleep": ("timeout", "time limit of 3 s"),
+    }
+    for kind, (status, reason) in expected.items():
+        assert outcomes[kind].status == status
+        assert reason in outcomes[kind].reason
+        assert str(tmp_path / "logs" / f"{kind}.log") in outcomes[kind].reason
+        assert "about to fail" in (tmp_path / "logs" / f"{kind}.log").read_text()
+    assert "Traceback" in (tmp_path / "logs" / "bug.log").read_text()
+    assert (tmp_path / "out").read_text() == "x\n" * 3
+
+
+def test_work_waits_for_what_it_needs_without_holding_a_worker(tmp_path):
+    out = tmp_path / "out"
+    works = [work(tmp_path, f"cell{i}", write, out, f"cell{i}", needs=["train"]) for i in range(3)]
+    works += [work(tmp_path, "train", write, out, "train", 0.5), work(tmp_path, "free", write, out, "free")]
+    observer = Silent()
+    outcomes = Pool(workers=2).run(works, observer)
+    assert out.read_text().split()[:2] == ["free", "train"]
+    assert observer.most == 2
+    assert {outcome.status for outcome in outcomes.values()} == {"finished"}
+
+
+def test_what_needs_a_failure_is_given_up_with_its_reason(pool, tmp_path):
+    works = [
+        work(tmp_path, "train", fail, "error"),
+        work(tmp_path, "cell", write, tmp_path / "out", "x", needs=["train"]),
+        work(tmp_path, "after", write, tmp_path / "out", "x", needs=["cell"]),
+    ]
+    outcomes = pool.run(works, Silent())
+    assert outcomes["cell"].status == "failed"
+    assert "needs train, which failed: states.npz: row 3 is nan" in outcomes["cell"].reason
+    assert outcomes["after"].status == "failed"
+    assert not (tmp_path / "out").exists()
+
+
+def test_threads_are_limited_and_work_after_the_fork(tmp_path):
+    outcomes = Pool(workers=1).run([work(tmp_path, "a", multiply, tmp_path / "a")], Silent())
+    assert outcomes["a"].reason is None
+    assert (tmp_path / "a").read_text() == "64000000 1 1"
+
+
+def test_an_interrupt_ends_the_jobs(pool, tmp_path):
+    class Impatient(Silent):
+        def tick(self, running) -> None:
+            self.running = list(running)
+            raise KeyboardInterrupt
+
+    observer = Impatient()
+    start = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        pool.run([work(tmp_path, "a", fail, "sleep")], observer)
+    assert time.monotonic() - start < 10
+    assert observer.running[0].process.exitcode == -signal.SIGTERM
+
+
+@pytest.mark.parametrize("bad", [{"workers": 0}, {"workers": 1, "threads": -1}, {"workers": 1, "time_limit": 0.0}])
+def test_numbers_that_make_no_sense_are_refused(bad):
+    with pytest.raises(ConfigError, match="must be positive"):
+        Pool(**bad)
+
+
+def test_workers_and_threads_do_not_exceed_the_cores():
+    assert Pool(None, threads=1).workers == cores()
+    assert Pool(None, threads=cores() + 1).workers == 1
+
+
+def test_reasons_tell_memory_from_other_failures():
+    assert why(RuntimeError("DefaultCPUAllocator: can't allocate memory: 5 TB"))[0] == "out_of_memory"
+    assert why(DataError("a\n b")) == ("failed", "a b")
+    assert why(KeyboardInterrupt())[0] == "interrupted"
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.mark.parametrize("stream", [io.StringIO(), Terminal()])
+def test_the_table_shows_what_runs_and_keeps_what_ended(stream, pool, tmp_path, monkeypatch):
+    monkeypatch.setattr("dadiff.launching.table.REDRAW_SECONDS", 0.0)
+    table = Table(stream, total=2, skipped=3)
+    pool.run([work(tmp_path, "a", write, tmp_path / "o", "x", 0.6), work(tmp_path, "b", fail, "error")], table)
+    table.close()
+    shown = stream.getvalue()
+    assert "[2/2]" in shown
+    assert "row 3 is nan" in shown
+    assert ("1 running" in shown) == stream.isatty()
+    assert ("\x1b[" in shown) == stream.isatty()
+
+
+def test_the_last_line_of_a_log_is_its_progress(tmp_path):
+    log = tmp_path / "log"
+    assert last_line(log) == ""
+    log.write_text("start\nsampling:  10%|#\rsampling:  42%|####  \x1b[A")
+    assert last_line(log).startswith("sampling:  42%|####")
+    assert [clock(s) for s in (7.31, 245, 7800)] == ["7.3 s", "4:05", "2:10:00"]
