@@ -137,4 +137,3 @@ def _numbers(record: Mapping[str, Any], field: str, count: int, place: str) -> n
     if values.shape != (count,):
         raise DataError(f"{place}: {field} has shape {values.shape}; expected {count} numbers")
     return values
-

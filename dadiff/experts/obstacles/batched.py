@@ -1,0 +1,169 @@
+"""The batched expert: thousands of environments at once, by augmented-Lagrangian Newton from several starts.
+
+One local solve is the method of multipliers (Nocedal & Wright, Algorithm 17.4): Newton with Armijo backtracking on the
+augmented Lagrangian; where its decrement is small the multipliers move on, and the penalty grows where the violation
+fell too little. Every environment keeps its own pace, and leaves the batch when it is done.
+
+Which side of each disc to pass is settled by trying: from the first optimum every set of the discs it touches is
+flipped to the other side, then single discs at the incumbent, until none gets cheaper.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dadiff.experts.obstacles.lagrangian import Lagrangian
+from dadiff.experts.obstacles.problem import TOLERANCE, ObstacleProblem, Solutions, Status, solutions
+from dadiff.experts.obstacles.quadratic import batch_last, obstacle_free, select
+from dadiff.experts.obstacles.starts import encounters, other_side, subsets
+
+_CHUNK = 2500  # environments solved side by side: fewer waste calls, more leave the cache
+_PENALTY, _PENALTY_GROWTH, _ENOUGH_FALL = 1.0, 10.0, 0.25
+_SETTLED = 1e-10  # Newton decrement, in units of cost, at which multipliers move on
+_ITERATIONS = 150
+_ARMIJO, _BACKTRACKS = 1e-4, 30
+_AT_MOST, _ROUNDS = 4, 3  # encounters that are flipped in combination; rounds of single flips
+_REACH = 1.0  # metres from a disc within which its other side is tried
+
+
+def solve(problem: ObstacleProblem, *, progress: bool = False) -> Solutions:
+    """The cheapest feasible path found for each environment.
+
+    Args:
+        progress: show a bar over environments.
+    """
+    from tqdm import tqdm
+
+    positions = np.empty((problem.count, problem.horizon + 1, 2))
+    status = np.empty(problem.count, dtype=int)
+    with tqdm(total=problem.count, desc="solving environments", unit="env", disable=not progress) as bar:
+        for first in range(0, problem.count, _CHUNK):
+            rows = np.arange(first, min(first + _CHUNK, problem.count))
+            positions[rows], status[rows] = _solve_chunk(problem.take(rows))
+            bar.update(len(rows))
+    return solutions(problem, positions, status)
+
+
+@dataclass
+class _Incumbents:
+    """The best path of each environment so far: positions (N, T+1, 2), cost (N,), inf while there is none."""
+
+    positions: np.ndarray
+    cost: np.ndarray
+
+    def challenge(self, rows: np.ndarray, positions: np.ndarray, cost: np.ndarray) -> np.ndarray:
+        """Let paths (J, ...) of environments `rows` (J,) compete; returns the environments that got cheaper."""
+        order = np.lexsort((cost, rows))
+        rows, best = np.unique(rows[order], return_index=True)
+        winners = order[best]
+        cheaper = cost[winners] < self.cost[rows] * (1 - 1e-9)
+        rows, winners = rows[cheaper], winners[cheaper]
+        self.positions[rows], self.cost[rows] = positions[winners], cost[winners]
+        return rows
+
+
+def _solve_chunk(problem: ObstacleProblem) -> tuple[np.ndarray, np.ndarray]:
+    """Positions and status of environments few enough to be solved side by side."""
+    free = obstacle_free(problem)
+    best = _Incumbents(free.copy(), np.full(problem.count, np.inf))
+    blocked = np.flatnonzero(~problem.feasible(free))
+    if len(blocked):
+        first, _ = _compete(problem, best, blocked, free[blocked])
+        _flip_sides(problem, best, blocked, first)
+    failed = ~np.isfinite(best.cost)
+    failed[problem.feasible(free)] = False
+    return best.positions, np.where(failed, Status.NOT_CONVERGED, Status.SOLVED)
+
+
+def _compete(
+    problem: ObstacleProblem, best: _Incumbents, rows: np.ndarray, start: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Solve environments `rows` (J,) from `start` (J, T+1, 2); returns those paths and the rows that got cheaper."""
+    jobs = problem.take(rows)
+    positions, converged = minimise(jobs, start)
+    cost = np.where(converged & jobs.feasible(positions), jobs.cost(positions, jobs.inputs(positions)), np.inf)
+    return positions, best.challenge(rows, positions, cost)
+
+
+def _flip_sides(problem: ObstacleProblem, best: _Incumbents, rows: np.ndarray, positions: np.ndarray) -> None:
+    """Improve the incumbents of `rows` (J,), whose first optima are `positions` (J, T+1, 2), by passing elsewhere."""
+    largest = None
+    for _ in range(1 + _ROUNDS):
+        here = problem.take(rows)
+        met = encounters(here, positions, _REACH)
+        job, flip = subsets(here, positions, met, _AT_MOST, largest=largest)
+        if not len(job):
+            return
+        start = other_side(here.take(job), positions[job], met[job] & ~flip, flip)
+        _, rows = _compete(problem, best, rows[job], start)
+        positions, largest = best.positions[rows], 1
+
+
+def minimise(problem: ObstacleProblem, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """One local optimum of each environment, from `start` (N, T+1, 2) on.
+
+    Returns:
+        Positions (N, T+1, 2), and (N,) whether the method converged there.
+    """
+    result, converged = start.copy(), np.zeros(problem.count, dtype=bool)
+    rows = np.arange(problem.count)
+    L, p = Lagrangian.of(problem, _PENALTY), batch_last(start)
+    violation = np.full(problem.count, np.inf)
+    for _ in range(_ITERATIONS):
+        p, decrement = _descend(L, p)
+        L, violation, done = _update(L, p, decrement <= _SETTLED, violation)
+        if done.any():
+            result[rows[done]], converged[rows[done]] = np.moveaxis(p[..., done], -1, 0), True
+            going = np.flatnonzero(~done)
+            rows, L, p, violation = rows[going], L.take(going), select(p, going), violation[going]
+        if not len(rows):
+            break
+    result[rows] = np.moveaxis(p, -1, 0)
+    return result, converged
+
+
+def _descend(L: Lagrangian, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """One damped Newton step: the new p, and half the decrement g' H^-1 g before it, (N,)."""
+    g, offset = L.constraint(p)
+    s = L.force(g)
+    gradient = L.gradient(p, s, offset)
+    step = L.newton_step(gradient, s, offset)
+    decrement = -(gradient * step).sum(axis=(0, 1)) / 2
+    return _backtrack(L, p, step, decrement), decrement
+
+
+def _backtrack(L: Lagrangian, p: np.ndarray, step: np.ndarray, decrement: np.ndarray) -> np.ndarray:
+    """p + a step with the first a = 1, 1/2, ... that decreases L enough (Armijo); environments apart."""
+    before, trial = L.value(p), p.copy()
+    trial[2:] += step
+    slack = 1e-12 * (1 + np.abs(before))  # rounding, near convergence
+    wrong = np.flatnonzero(L.value(trial) > before - 2 * _ARMIJO * decrement + slack)
+    size = 1.0
+    for _ in range(_BACKTRACKS):
+        if not len(wrong):
+            break
+        size /= 2
+        shorter = select(p, wrong)
+        shorter[2:] += size * select(step, wrong)
+        trial[..., wrong] = shorter
+        value = L.take(wrong).value(shorter)
+        wrong = wrong[value > (before - 2 * _ARMIJO * size * decrement + slack)[wrong]]
+    return trial
+
+
+def _update(
+    L: Lagrangian, p: np.ndarray, settled: np.ndarray, violation: np.ndarray
+) -> tuple[Lagrangian, np.ndarray, np.ndarray]:
+    """Move multipliers and penalties on where Newton has settled; the new L, violations and who is done."""
+    if not settled.any():
+        return L, violation, settled
+    g, _ = L.constraint(p)
+    s = L.force(g)
+    now = np.abs(np.maximum(g, -L.multiplier / L.penalty)).max(axis=(0, 1), initial=0.0)
+    done = settled & (now <= TOLERANCE / 10)
+    grow = settled & (now > _ENOUGH_FALL * violation)
+    multiplier = np.where(settled, s, L.multiplier)
+    penalty = np.where(grow, _PENALTY_GROWTH * L.penalty, L.penalty)
+    return Lagrangian(L.f, L.centre, L.radius, multiplier, penalty), np.where(settled, now, violation), done

@@ -1,0 +1,152 @@
+"""Environments of the obstacle task: their arrays, their checks, and the condition vector E that encodes them.
+
+    E = [x_init (4), target (2), W waypoint slots (x, y, t/T, mask), O obstacle slots (x, y, r, mask)]
+
+Absent slots are zero. E holds the whole environment, so that `decode` undoes `encode`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from dadiff.errors import DataError, InfeasibleError, ShapeError
+
+FIXED, SLOT = 6, 4
+"""Numbers of E before the slots, and numbers a slot."""
+
+
+@dataclass(frozen=True)
+class Environments:
+    """N environments with W waypoint slots and O obstacle slots; what a mask leaves out is zero.
+
+    Args:
+        x_init: (N, 4), positions and velocities.
+        target: (N, 2), due at T.
+        waypoint: (N, W, 2).
+        time: (N, W), in steps.
+        due: whether there is a waypoint, (N, W).
+        centre: (N, O, 2).
+        radius: (N, O), without margin.
+        present: whether there is an obstacle, (N, O).
+    """
+
+    x_init: np.ndarray
+    target: np.ndarray
+    waypoint: np.ndarray
+    time: np.ndarray
+    due: np.ndarray
+    centre: np.ndarray
+    radius: np.ndarray
+    present: np.ndarray
+
+    @property
+    def count(self) -> int:
+        """N."""
+        return len(self.x_init)
+
+    def take(self, index: np.ndarray) -> Environments:
+        """The environments at `index`."""
+        return Environments(*(getattr(self, field.name)[index] for field in fields(self)))
+
+
+def join(parts: list[Environments]) -> Environments:
+    """One set of environments after the other."""
+    return Environments(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Environments)))
+
+
+def size(max_waypoints: int, max_obstacles: int) -> int:
+    """c, the length of E."""
+    return FIXED + SLOT * (max_waypoints + max_obstacles)
+
+
+def encode(environments: Environments, horizon: int) -> np.ndarray:
+    """E, (N, c)."""
+    e = environments
+    waypoints = np.concatenate([e.waypoint, e.time[..., None] / horizon, e.due[..., None]], axis=-1)
+    obstacles = np.concatenate([e.centre, e.radius[..., None], e.present[..., None]], axis=-1)
+    slots = np.concatenate([waypoints, obstacles], axis=1).reshape(e.count, -1)
+    return np.concatenate([e.x_init, e.target, slots], axis=-1)
+
+
+def decode(environment: np.ndarray, horizon: int, max_waypoints: int) -> Environments:
+    """The environments of E (N, c).
+
+    Raises:
+        ShapeError: if c is not the length of a condition vector with `max_waypoints`.
+    """
+    if environment.ndim != 2 or environment.shape[1] < size(max_waypoints, 0) or (environment.shape[1] - FIXED) % SLOT:
+        raise ShapeError(
+            f"environment has shape {environment.shape}; expected (N, {FIXED} + {SLOT} ({max_waypoints} waypoints + "
+            "obstacles)), from this task's settings"
+        )
+    slots = environment[:, FIXED:].reshape(len(environment), -1, SLOT)
+    waypoints, obstacles = slots[:, :max_waypoints], slots[:, max_waypoints:]
+    time = np.rint(waypoints[..., 2] * horizon)
+    x_init, target = environment[:, :4], environment[:, 4:FIXED]
+    due, present = waypoints[..., 3] > 0.5, obstacles[..., 3] > 0.5
+    return Environments(x_init, target, waypoints[..., :2], time, due, obstacles[..., :2], obstacles[..., 2], present)
+
+
+def check(environments: Environments, horizon: int, time_step: float, where: str = "") -> None:
+    """Raise unless every environment can be solved; the message names its index and the field.
+
+    Args:
+        time_step: in seconds; x_init fixes p(1) too.
+        where: what the message begins with, such as a file's name.
+
+    Raises:
+        DataError: for values that are not finite, negative radii, or times that are doubled or outside 1..T.
+        InfeasibleError: if start, waypoint or target lies inside a disc.
+    """
+    for index in range(environments.count):
+        one = environments.take(np.array([index]))
+        place = f"{where}environment {index}"
+        _check_values(one, place)
+        _check_times(one, horizon, place)
+        _check_clear(one, time_step, place)
+
+
+def _check_values(one: Environments, place: str) -> None:
+    named: list[tuple[str, Any]] = [("x_init", one.x_init), ("target", one.target)]
+    for k in np.flatnonzero(one.due[0]):
+        named += [(f"waypoints[{k}].position", one.waypoint[0, k]), (f"waypoints[{k}].time", one.time[0, k])]
+    for j in np.flatnonzero(one.present[0]):
+        named += [(f"obstacles[{j}].centre", one.centre[0, j]), (f"obstacles[{j}].radius", one.radius[0, j])]
+    for name, value in named:
+        if not np.isfinite(value).all():
+            raise DataError(f"{place}: {name} is {_show(value)}; every number must be finite")
+        if name.endswith("radius") and value <= 0:
+            raise DataError(f"{place}: {name} is {value:g}; a radius must be positive (metres)")
+
+
+def _check_times(one: Environments, horizon: int, place: str) -> None:
+    seen = {horizon: "the target, which is due at T"}
+    for k in np.flatnonzero(one.due[0]):
+        time, name = one.time[0, k], f"waypoints[{k}].time"
+        if time != np.rint(time) or not 1 <= time <= horizon:
+            raise DataError(f"{place}: {name} is {time:g}; expected a whole number in 1..{horizon} (steps)")
+        if int(time) in seen:
+            raise DataError(f"{place}: {name} is {time:g}, the time of {seen[int(time)]}; no two may share a time")
+        seen[int(time)] = f"waypoints[{k}]"
+
+
+def _check_clear(one: Environments, time_step: float, place: str) -> None:
+    position = one.x_init[0, :2]
+    points = [("x_init", position), ("x_init (after one step)", position + time_step * one.x_init[0, 2:])]
+    points += [(f"waypoints[{k}].position", one.waypoint[0, k]) for k in np.flatnonzero(one.due[0])]
+    points.append(("target", one.target[0]))
+    for name, point in points:
+        for j in np.flatnonzero(one.present[0]):
+            centre, radius = one.centre[0, j], one.radius[0, j]
+            if np.linalg.norm(point - centre) < radius:
+                raise InfeasibleError(
+                    f"{place}: {name} {_show(point)} lies inside obstacles[{j}] (centre {_show(centre)}, radius "
+                    f"{radius:g}); move one of them"
+                )
+
+
+def _show(value: np.ndarray) -> str:
+    return "(" + ", ".join(f"{v:g}" for v in np.ravel(value)) + ")"
