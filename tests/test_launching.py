@@ -65,11 +65,11 @@ def work(root: Path, key: str, function, *arguments, needs=()) -> Work:
 
 @pytest.fixture(scope="module")
 def pool():
-    return Pool(workers=4, time_limit=3.0, preload=["torch"])
+    return Pool(workers=4, preload=["torch"])
 
 
 def test_every_way_to_end_has_its_status_and_reason_and_harms_no_other(pool, tmp_path):
-    kinds = ["error", "bug", "memory", "exit", "kill", "crash", "sleep"]
+    kinds = ["error", "bug", "memory", "exit", "kill", "crash"]
     works = [work(tmp_path, kind, fail, kind) for kind in kinds]
     works += [work(tmp_path, f"fine{i}", write, tmp_path / "out", "x") for i in range(3)]
     outcomes = pool.run(works, Silent())
@@ -80,7 +80,6 @@ def test_every_way_to_end_has_its_status_and_reason_and_harms_no_other(pool, tmp
         "exit": ("failed", "exited with code 7"),
         "kill": ("killed", "killed by SIGKILL, perhaps because memory ran out"),
         "crash": ("killed", "killed by SIGSEGV"),
-        "sleep": ("timeout", "time limit of 3 s"),
     }
     for kind, (status, reason) in expected.items():
         assert outcomes[kind].status == status
@@ -89,6 +88,13 @@ def test_every_way_to_end_has_its_status_and_reason_and_harms_no_other(pool, tmp
         assert "about to fail" in (tmp_path / "logs" / f"{kind}.log").read_text()
     assert "Traceback" in (tmp_path / "logs" / "bug.log").read_text()
     assert (tmp_path / "out").read_text() == "x\n" * 3
+
+
+def test_a_job_that_takes_too_long_is_ended(pool, tmp_path):
+    works = [work(tmp_path, "sleep", fail, "sleep")]
+    outcomes = Pool(workers=1, time_limit=0.5).run(works, Silent())
+    assert outcomes["sleep"].status == "timeout"
+    assert "time limit of 0.5 s" in outcomes["sleep"].reason
 
 
 def test_work_waits_for_what_it_needs_without_holding_a_worker(tmp_path):

@@ -103,6 +103,7 @@ class Pool:
     def run(self, works: Sequence[Work], observer: Observer) -> dict[str, Outcome]:
         """Run everything; returns how each ended, by key. Interrupted, it stops what runs and raises again."""
         waiting, running, outcomes = list(works), list[Running](), dict[str, Outcome]()
+        self._await_server()
         try:
             while waiting or running:
                 waiting = _without_hopeless(waiting, outcomes, observer)
@@ -118,6 +119,12 @@ class Pool:
         finally:
             stop([entry.process for entry in running])
         return outcomes
+
+    def _await_server(self) -> None:
+        """Wait until the server has imported everything, so that no job's time limit counts that."""
+        probe = self._context.Process(target=int)
+        probe.start()
+        probe.join()
 
     def _start(self, work: Work) -> Running:
         make_folder(work.log_file.parent)

@@ -208,13 +208,11 @@ class Tracking:
         self._client.log_batch(run_id, tags=[RunTag(name, value) for name, value in tags.items()])
 
     def _search(self, condition: str) -> list[Run]:
-        found: list[Run] = []
         page = self._client.search_runs([self._experiment_id], condition)
-        while page:
-            found += page
-            page = (
-                self._client.search_runs([self._experiment_id], condition, page_token=page.token) if page.token else []
-            )
+        found: list[Run] = list(page)
+        while page.token:
+            page = self._client.search_runs([self._experiment_id], condition, page_token=page.token)
+            found.extend(page)
         return found
 
     def _is_gone(self, run_id: str) -> bool:
