@@ -1,0 +1,55 @@
+"""`dadiff-report`: from a stored sweep to a folder with the report."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import sys
+from pathlib import Path
+
+from dadiff.errors import DadiffError
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="dadiff-report", description="Write the report of stored sweeps.")
+    parser.add_argument("sweep", nargs="+", help="name of a sweep, or several to report as one")
+    parser.add_argument("--output-dir", type=Path, default=Path("outputs"), help="where results lie (default: outputs)")
+    parser.add_argument("--definition", help="which report to write (default: the one made for the sweep)")
+    parser.add_argument("--out", type=Path, help="folder to write (default: <output-dir>/reports/<sweep>)")
+    parser.add_argument(
+        "--tracking-uri", help="read an MLflow parent run or experiment of that name from there instead"
+    )
+    return parser
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Write one report; 0 if it was written."""
+    logging.basicConfig(format="%(message)s")
+    options = _parser().parse_args(arguments)
+    try:
+        index = write(options)
+    except DadiffError as error:
+        print(f"dadiff-report: {error}", file=sys.stderr)
+        return 1
+    print(f"report: {index}")
+    return 0
+
+
+def write(options: argparse.Namespace) -> Path:
+    """Read, gather and render; imports are late so that help answers at once."""
+    from dadiff.reporting.aggregation import Evidence
+    from dadiff.reporting.claims import read_ledger
+    from dadiff.reporting.definitions import folder, for_sweep, load
+    from dadiff.reporting.render import render
+    from dadiff.reporting.report import build
+    from dadiff.reporting.sources import read_sweeps
+
+    sweep = read_sweeps(options.output_dir, options.sweep)
+    definition = load(options.definition) if options.definition else for_sweep(options.sweep[0])
+    command = f"dadiff-report {' '.join(options.sweep)} --definition {definition.name}"
+    report = build(definition, Evidence(sweep), read_ledger(folder() / "claims.yaml"), command)
+    return render(report, options.out or options.output_dir / "reports" / sweep.name)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

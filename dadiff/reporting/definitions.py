@@ -1,0 +1,107 @@
+"""What a report holds, as data: `reports/<name>.yaml`.
+
+title, about        words
+sweeps              patterns of sweep names that this definition is for
+claims              ids of the ledger; absent: all of them
+figures             id, kind (a module of `dadiff.reporting.figures`), title, caption, options
+tables              id, title, caption, options
+"""
+
+from __future__ import annotations
+
+import fnmatch
+import importlib
+import inspect
+import pkgutil
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from dadiff.errors import ConfigError
+from dadiff.reporting import figures, tables
+
+
+@dataclass(frozen=True)
+class Item:
+    """One figure or table: `kind` is its module; tables have the one kind `table`."""
+
+    id: str
+    title: str
+    kind: str = "table"
+    caption: str = ""
+    options: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def collect(self) -> Callable[..., Any]:
+        """The function that gathers its numbers.
+
+        Raises:
+            ConfigError: if the kind is unknown or its options do not fit.
+        """
+        collect = tables.collect if self.kind == "table" else _figure(self.kind, self.id)
+        try:
+            inspect.signature(collect).bind(None, **self.options)
+        except TypeError as error:
+            raise ConfigError(f"report item {self.id}: {error}; see the options of kind {self.kind!r}") from None
+        return collect
+
+
+def _figure(kind: str, item: str) -> Callable[..., Any]:
+    kinds = sorted(module.name for module in pkgutil.iter_modules(figures.__path__) if module.name != "style")
+    if kind not in kinds:
+        raise ConfigError(f"report item {item}: unknown kind {kind!r}; expected {', '.join(kinds)}")
+    module = importlib.import_module(f"{figures.__name__}.{kind}")
+    return module.collect  # type: ignore[no-any-return]
+
+
+@dataclass(frozen=True)
+class Definition:
+    """One report."""
+
+    name: str
+    title: str
+    about: str = ""
+    sweeps: list[str] = field(default_factory=list)
+    claims: list[str] | None = None
+    figures: list[Item] = field(default_factory=list)
+    tables: list[Item] = field(default_factory=list)
+
+
+def folder() -> Path:
+    """Where definitions, ledger and templates lie: in the installed package, or beside it in a checkout."""
+    package = Path(__file__).parents[1]
+    inside = package / "shipped" / "reports"
+    return inside if inside.is_dir() else package.parent / "reports"
+
+
+def load(name: str) -> Definition:
+    """The definition of a name.
+
+    Raises:
+        ConfigError: if there is none, or it has unknown or missing keys.
+    """
+    path = folder() / f"{name}.yaml"
+    if not path.is_file():
+        raise ConfigError(f"no report definition {name!r}; found {', '.join(names())} in {folder()}")
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        parts = {kind: [Item(**item) for item in content.pop(kind, [])] for kind in ("figures", "tables")}
+        return Definition(name=name, **parts, **content)
+    except (TypeError, AttributeError, yaml.YAMLError) as error:
+        raise ConfigError(f"{path}: {error}; expected the keys of a report definition") from None
+
+
+def names() -> list[str]:
+    """All definitions."""
+    return sorted(path.stem for path in folder().glob("*.yaml") if path.stem != "claims")
+
+
+def for_sweep(sweep: str) -> Definition:
+    """The definition of the sweep's name, else the first whose patterns fit, else `default`."""
+    if sweep in names():
+        return load(sweep)
+    fitting = [d for d in map(load, names()) if any(fnmatch.fnmatchcase(sweep, pattern) for pattern in d.sweeps)]
+    return fitting[0] if fitting else load("default")

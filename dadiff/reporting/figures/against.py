@@ -1,0 +1,156 @@
+"""Metrics against a numeric axis, one line a method: the length S of the recording, the length of training, ...
+
+With a baseline the line is the ratio of means to it, on the same cases and noise; below 1 is better.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from dadiff.reporting.aggregation import Evidence, Method, case_scalars, has_metric, pair, varying, weights_for
+from dadiff.reporting.figures.style import legend_below, letter, log_axis, look_of, panels
+from dadiff.reporting.labels import axis_name, axis_value, method_name, metric_name
+from dadiff.reporting.selection import Selector
+from dadiff.reporting.statistics import Estimate, mean, ratio
+
+
+@dataclass(frozen=True)
+class Line:
+    """One method over the axis."""
+
+    label: str
+    axes: dict[str, Any]
+    x: list[float]
+    y: list[Estimate]
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One metric under one condition, and levels of methods that do not depend on the axis."""
+
+    title: str
+    metric: str
+    lines: list[Line]
+    levels: list[Line]
+
+
+@dataclass(frozen=True)
+class Against:
+    """What the figure shows."""
+
+    axis: str
+    relative: str
+    panels: list[Panel]
+    marked: dict[str, float]
+    runs: list[str]
+    notes: list[str]
+
+    def draw(self, columns: int) -> Figure:
+        """One panel a metric and condition, both axes logarithmic."""
+        figure, axes = panels(len(self.panels), columns)
+        for ax, panel in zip(axes, self.panels, strict=True):
+            _draw_panel(ax, panel)
+            self._mark(ax)
+            ax.set_xlabel(axis_name(self.axis))
+            ax.set_ylabel(f"relative to {self.relative}" if self.relative else "")
+            ax.set_title(", ".join(filter(None, (metric_name(panel.metric), panel.title))), wrap=True)
+        letter(axes)
+        legend_below(figure, axes)
+        return figure
+
+    def _mark(self, ax: Axes) -> None:
+        for text, x in self.marked.items():
+            ax.axvline(x, color="#888888", lw=0.8, ls=":", zorder=0)
+            ax.annotate(text, (x, 0), xycoords=("data", "axes fraction"), xytext=(2, 3), textcoords="offset points",
+                        va="bottom", fontsize=7, rotation=90, color="#888888")  # fmt: skip
+        if self.relative:
+            ax.axhline(1, color="#888888", lw=0.8, zorder=0)
+
+
+def _draw_panel(ax: Axes, panel: Panel) -> None:
+    for line in panel.lines:
+        look, y = look_of(line.axes), [e.value for e in line.y]
+        bars = [[e.value - e.low for e in line.y], [e.high - e.value for e in line.y]]
+        ax.errorbar(line.x, y, yerr=bars, color=look.colour, ls=look.line, marker=look.marker, mfc=look.fill,
+                    capsize=2, lw=1.4, label=line.label)  # fmt: skip
+    for line in panel.levels:
+        look, estimate = look_of(line.axes), line.y[0]
+        ax.axhline(estimate.value, color=look.colour, ls=(0, (2, 2)), lw=1.2, label=line.label)
+        ax.axhspan(estimate.low, estimate.high, color=look.colour, alpha=0.12, lw=0)
+    values = [e.value for line in (*panel.lines, *panel.levels) for e in line.y]
+    if values and min(values) > 0:
+        log_axis(ax, "y")
+    log_axis(ax, "x")
+
+
+def collect(
+    evidence: Evidence,
+    *,
+    axis: str,
+    metrics: list[str],
+    cells: Selector,
+    by: str | None = None,
+    relative_to: Selector | None = None,
+    levels: Selector | None = None,
+    marked: dict[str, float] | None = None,
+) -> Against:
+    """Methods of `cells` over `axis`.
+
+    Args:
+        by: an axis with a panel for each of its values.
+        relative_to: the baseline that values are divided by.
+        levels: methods without the axis, drawn as horizontal lines.
+        marked: text -> place on the axis.
+    """
+    wanted = evidence.methods({**cells, axis: {"not": None}})
+    used = [m for m in wanted if m.finished and (not relative_to or evidence.partner(m, relative_to))]
+    flat = [m for m in evidence.methods(levels) if m.finished] if levels else []
+    values = list(dict.fromkeys(m.axes.get(by) for m in used)) if by else [None]
+    ignored = {axis, by, *varying(flat)}
+    shown = [name for name in varying(used) if name not in ignored]
+
+    def panel(metric: str, value: Any) -> Panel:
+        here = [m for m in used if has_metric(m.finished, metric) and (by is None or m.axes.get(by) == value)]
+        beside = [m for m in flat if has_metric(m.finished, metric) and (by is None or m.axes.get(by) in (value, None))]
+        lines = [_line(evidence, group, axis, metric, shown, relative_to) for group in _lines(here, axis)]
+        return Panel(axis_value(by, value) if by else "", metric, lines, [_level(m, metric) for m in beside])
+
+    every = [p for p in (panel(metric, value) for metric in metrics for value in values) if p.lines]
+    runs = [key for m in (*used, *flat) for key in m.keys] if every else []
+    notes = [f"{method_name(m.axes, [*shown, by or '', axis])}: {m.outcome}" for m in wanted if m.lost]
+    relative = method_name(dict(relative_to)) if relative_to else ""
+    return Against(axis, relative, every, marked or {}, runs, notes)
+
+
+def _lines(methods: list[Method], axis: str) -> list[list[Method]]:
+    groups: dict[str, list[Method]] = {}
+    for method in methods:
+        rest = {name: value for name, value in method.axes.items() if name != axis}
+        groups.setdefault(repr(sorted(rest.items())), []).append(method)
+    return [sorted(group, key=lambda m: m.axes[axis]) for group in groups.values()]
+
+
+def _line(
+    evidence: Evidence, group: list[Method], axis: str, metric: str, shown: list[str], baseline: Selector | None
+) -> Line:
+    y = [_estimate(evidence, method, metric, baseline) for method in group]
+    return Line(method_name(group[0].axes, shown), group[0].axes, [m.axes[axis] for m in group], y)
+
+
+def _estimate(evidence: Evidence, method: Method, metric: str, baseline: Selector | None) -> Estimate:
+    other = evidence.partner(method, baseline) if baseline else None
+    if other is None:
+        values = case_scalars(method.finished, metric)
+        return mean(values, weights_for(values.shape))
+    own, theirs = pair(method, other)
+    values = case_scalars(own, metric)
+    return ratio(values, case_scalars(theirs, metric), weights_for(values.shape))
+
+
+def _level(method: Method, metric: str) -> Line:
+    values = case_scalars(method.finished, metric)
+    return Line(method_name(method.axes), method.axes, [], [mean(values, weights_for(values.shape))])

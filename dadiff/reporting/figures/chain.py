@@ -1,0 +1,79 @@
+"""Theorem 1 along the chain: the Mahalanobis distance on the support of the law, and what lies off the support."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from dadiff.reporting.aggregation import Evidence, varying
+from dadiff.reporting.figures.style import legend_below, letter, log_axis, look_of, panels
+from dadiff.reporting.labels import method_name
+from dadiff.reporting.selection import Selector
+from dadiff.reporting.sources import Cell
+
+PANELS = {
+    "on_support": "distance on the support",
+    "off_support": "squared distance off it",
+    "grew_predict": "share that grew, prediction",
+    "grew_project": "share that grew, projection",
+}
+
+
+@dataclass(frozen=True)
+class Trace:
+    """One run: step i of the chain, from noise to plan, and a value after its projection (shares: a half-step)."""
+
+    label: str
+    axes: dict[str, Any]
+    steps: np.ndarray
+    values: dict[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class Chain:
+    """What the figure shows."""
+
+    traces: list[Trace]
+    runs: list[str]
+    notes: list[str]
+
+    def draw(self, columns: int) -> Figure:
+        """Sampling runs from left to right; distances are logarithmic, shares are from 0 to 1."""
+        figure, axes = panels(len(PANELS), columns)
+        for ax, (name, title) in zip(axes, PANELS.items(), strict=True):
+            for trace in self.traces:
+                look = look_of(trace.axes)
+                ax.plot(trace.steps, trace.values[name], color=look.colour, ls=look.line, lw=1.2, label=trace.label)
+            ax.invert_xaxis()
+            ax.set_xlabel("diffusion step i")
+            ax.set_title(title)
+            if name.endswith("support"):
+                log_axis(ax, "y")
+            else:
+                ax.set_ylim(-0.03, 1.03)
+        letter(axes)
+        legend_below(figure, axes)
+        return figure
+
+
+def collect(evidence: Evidence, *, cells: Selector) -> Chain:
+    """The first replicate of each method whose chain was followed, diverged ones as far as they came."""
+    methods = evidence.methods(cells)
+    followed = [(m, c) for m in methods for c in m.cells[:1] if c.has("chain")]
+    shown = varying([m for m, _ in followed])
+    traces = [_trace(cell, method_name(method.axes, shown), method.axes) for method, cell in followed]
+    notes = [f"{method_name(m.axes, shown)}: {m.outcome}" for m in methods if m.lost]
+    return Chain(traces, [cell.key for _, cell in followed], notes)
+
+
+def _trace(cell: Cell, label: str, axes: dict[str, Any]) -> Trace:
+    table = cell.table("chain")
+    stages = {name: table[table["stage"] == name].set_index("i") for name in ("predict", "project")}
+    last = stages["project"] if len(stages["project"]) else stages["predict"]
+    steps = stages["predict"].index.to_numpy()
+    values = {name: last[name].reindex(steps).to_numpy() for name in ("on_support", "off_support")}
+    grew = {f"grew_{name}": part["grew"].reindex(steps).to_numpy() for name, part in stages.items()}
+    return Trace(label, axes, steps, values | grew)

@@ -1,0 +1,111 @@
+"""One metric by method: means with intervals and every replicate as a dot. Logarithmic axis.
+
+Serves cost ratios, collisions, and gains; on the fleet every dot is a robot.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from dadiff.reporting.aggregation import Evidence, Method, case_scalars, varying, weights_for
+from dadiff.reporting.figures.style import letter, log_axis, look_of, panels
+from dadiff.reporting.labels import method_name, metric_name
+from dadiff.reporting.selection import Selector
+from dadiff.reporting.statistics import Estimate, mean
+
+
+@dataclass(frozen=True)
+class Row:
+    """One method: its estimate, and a dot for each robot, or for each case where there is one robot."""
+
+    label: str
+    axes: dict[str, Any]
+    estimate: Estimate | None
+    dots: np.ndarray
+    outcome: str
+
+
+@dataclass(frozen=True)
+class Methods:
+    """What the figure shows: for each metric its rows, the first one on top."""
+
+    metrics: list[str]
+    rows: list[list[Row]]
+    dot: str
+    log: bool
+    best: dict[str, float]
+    runs: list[str]
+    notes: list[str]
+
+    def draw(self, columns: int) -> Figure:
+        """One panel a metric."""
+        figure, axes = panels(len(self.metrics), columns, width=4.1, height=0.9 + 0.32 * len(self.rows[0]))
+        for index, (ax, metric, rows) in enumerate(zip(axes, self.metrics, self.rows, strict=True)):
+            _draw_rows(ax, rows, log=self.log)
+            ax.set_title(metric_name(metric))
+            ax.tick_params(labelleft=index % columns == 0)
+            if metric in self.best:
+                ax.axvline(self.best[metric], color="#888888", lw=0.8, ls=":", zorder=0)
+        letter(axes)
+        return figure
+
+
+def _draw_rows(ax: Axes, rows: list[Row], *, log: bool) -> None:
+    for y, row in enumerate(rows):
+        look = look_of(row.axes)
+        if row.estimate is None:
+            ax.annotate(
+                shortened(row.outcome),
+                (0.02, y),
+                xycoords=("axes fraction", "data"),
+                va="center",
+                style="italic",
+                fontsize=7.5,
+            )
+            continue
+        offsets = y + 0.32 * (np.arange(len(row.dots)) / max(1, len(row.dots) - 1) - 0.5)
+        ax.plot(row.dots, offsets, ".", color=look.colour, alpha=0.6, ms=5.5, mew=0)
+        bars = [[row.estimate.value - row.estimate.low], [row.estimate.high - row.estimate.value]]
+        ax.errorbar(
+            row.estimate.value, y, xerr=bars, fmt=look.marker, color=look.colour, mfc=look.fill, ms=6, capsize=3
+        )
+    ax.set_yticks(range(len(rows)), [row.label for row in rows])
+    ax.set_ylim(len(rows) - 0.4, -0.6)
+    if log and any(row.estimate for row in rows):
+        log_axis(ax, "x")
+
+
+def shortened(text: str, most: int = 30) -> str:
+    """A text that fits into a panel; the whole of it stands in the notes."""
+    return text if len(text) <= most else text[: most - 1] + "…"
+
+
+def collect(
+    evidence: Evidence, *, metrics: list[str], cells: Selector, log: bool = True, best: dict[str, float] | None = None
+) -> Methods:
+    """The methods that `cells` asks for, diverged ones named in their place.
+
+    Args:
+        best: metric -> where a dotted line marks what cannot be bettered.
+    """
+    methods = evidence.methods(cells)
+    shown, alive = varying(methods), [method for method in methods if method.finished]
+    rows = [[_row(method, metric, shown) for method in methods] for metric in metrics] if alive else []
+    robots = any("robots" in method.counts() for method in alive)
+    notes = [f"{method_name(m.axes, shown)}: {m.outcome}" for m in methods if m.lost]
+    return Methods(metrics if alive else [], rows, "robot" if robots else "case", log, best or {},
+                   [key for m in alive for key in m.keys], notes)  # fmt: skip
+
+
+def _row(method: Method, metric: str, shown: list[str]) -> Row:
+    label = method_name(method.axes, shown)
+    if not method.finished:
+        return Row(label, method.axes, None, np.empty(0), method.outcome)
+    values = case_scalars(method.finished, metric)
+    dots = np.nanmean(values, axis=-1) if values.ndim > 2 else values
+    return Row(label, method.axes, mean(values, weights_for(values.shape)), dots.ravel(), "")

@@ -1,0 +1,170 @@
+"""Paths in the plane: a sample of the data with waypoints and discs, and plans of several methods beside the optimum.
+
+Fig. 3 (a, b) of the paper; on the fleet a row a robot. The first two states are the position.
+"""
+
+from __future__ import annotations
+
+import textwrap
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle
+
+from dadiff.reporting.aggregation import Evidence, Method, varying
+from dadiff.reporting.figures.style import INK, legend_below, letter, look_of, panels
+from dadiff.reporting.labels import method_name
+from dadiff.reporting.selection import Selector
+from dadiff.tasks.environments import decode
+
+PANEL_SIDE = 2.9
+REPLAY = (0, (1, 1))
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What lies in the plane: positions (k, 2), discs (k, 3) as x, y, r."""
+
+    waypoints: np.ndarray
+    target: np.ndarray
+    discs: np.ndarray
+
+
+@dataclass(frozen=True)
+class Path:
+    """Positions (T+1, 2) of one plan, and of the replay of its inputs."""
+
+    label: str
+    axes: dict[str, Any]
+    planned: np.ndarray
+    replayed: np.ndarray | None
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One picture: the optimum (T+1, 2) and the plans drawn over it."""
+
+    title: str
+    scene: Scene
+    optimum: np.ndarray
+    paths: list[Path]
+
+
+@dataclass(frozen=True)
+class Paths:
+    """What the figure shows."""
+
+    panels: list[Panel]
+    across: int
+    runs: list[str]
+    notes: list[str]
+
+    def draw(self, columns: int) -> Figure:
+        """Equal axes; panels of one row share their window."""
+        across = self.across if columns > 1 else min(2, self.across)
+        figure, axes = panels(len(self.panels), across, width=PANEL_SIDE, height=PANEL_SIDE + 0.15)
+        for ax, panel in zip(axes, self.panels, strict=True):
+            _draw_panel(ax, panel)
+            _window(ax, [p for p in self.panels if p.optimum is panel.optimum])
+        if self.across <= 2:
+            letter(axes)
+        if any(path.replayed is not None for panel in self.panels for path in panel.paths):
+            axes[0].plot([], [], color=INK, lw=1.5, label="plan")
+            axes[0].plot([], [], color=INK, ls=REPLAY, lw=1.8, label="replay of its inputs")
+        legend_below(figure, axes)
+        return figure
+
+
+def _draw_panel(ax: Axes, panel: Panel) -> None:
+    for x, y, r in panel.scene.discs:
+        ax.add_patch(Circle((x, y), r, fc="#e0604c", alpha=0.3, lw=0))
+    ax.plot(*panel.optimum.T, color=INK, lw=1.2, ls=(0, (3, 2)), label="optimum", zorder=3)
+    ax.plot(*panel.optimum[0], "o", color=INK, ms=4.5, zorder=4, label="start")
+    ax.plot(*panel.scene.target.T, "*", color="#d03a2b", ms=9, mew=0, zorder=4, label="target")
+    if len(panel.scene.waypoints):
+        ax.plot(*panel.scene.waypoints.T, "o", color="#3566c8", ms=5, zorder=4, label="waypoint")
+    for path in panel.paths:
+        look = look_of(path.axes)
+        label = path.label if path.replayed is None else ""
+        ax.plot(*path.planned.T, color=look.colour, ls=look.line, lw=1.5, label=label)
+        if path.replayed is not None:
+            ax.plot(*path.replayed.T, color=look.colour, ls=REPLAY, lw=1.8)
+    ax.set_title("\n".join(textwrap.wrap(panel.title, 30)))
+    ax.set_xlabel("x position")
+    ax.set_ylabel("y position")
+
+
+def _window(ax: Axes, shared: list[Panel]) -> None:
+    """Equal axes around all paths of the row, ignoring how far a poor plan strays."""
+    points = np.concatenate([shared[0].optimum, shared[0].scene.target, *(p.planned for s in shared for p in s.paths)])
+    optimum = np.concatenate([shared[0].optimum, shared[0].scene.target])
+    reach = 1.6 * max(np.ptp(optimum, axis=0).max(), 1.0)
+    centre = (optimum.max(0) + optimum.min(0)) / 2
+    points = points[(np.abs(points - centre) < reach).all(axis=1)]
+    middle, half = (points.max(0) + points.min(0)) / 2, 0.55 * max(np.ptp(points, axis=0).max(), 0.5)
+    ax.set_xlim(middle[0] - half, middle[0] + half)
+    ax.set_ylim(middle[1] - half, middle[1] + half)
+    ax.set_aspect("equal")
+
+
+def collect(
+    evidence: Evidence,
+    *,
+    cells: Selector,
+    case: int = 0,
+    robots: list[int] | None = None,
+    sample_of_data: bool = False,
+    apart: bool = False,
+) -> Paths:
+    """Plans of one case from the same noise: the first seed, the first plan.
+
+    Args:
+        case: among the stored examples.
+        robots: of a fleet, a row each.
+        sample_of_data: a first panel with the optimum alone.
+        apart: a panel a method, with the replay of its inputs, instead of one panel for all.
+    """
+    methods = evidence.methods(cells)
+    used = [m for m in methods if m.finished and "states" in m.finished[0].examples]
+    shown, drawn = varying(methods), []
+    for robot in (robots or [None]) if used else []:
+        scene, optimum = _scene(used[0], robot, case)
+        paths = [_path(method, robot, case, shown, replay=apart) for method in used]
+        title = "plans" if robot is None else f"robot {robot}"
+        if sample_of_data:
+            drawn.append(Panel("a sample of the data", scene, optimum, []))
+        if apart:
+            drawn += [
+                Panel(f"{title}: {p.label}" if robot is not None else p.label, scene, optimum, [p]) for p in paths
+            ]
+        else:
+            drawn.append(Panel(title, scene, optimum, paths))
+    across = len(used) if apart else 2
+    notes = [f"{method_name(m.axes, shown)}: {m.outcome}" for m in methods if m.lost]
+    return Paths(drawn, across, [m.finished[0].key for m in used], notes)
+
+
+def _of(method: Method, name: str, robot: int | None, case: int) -> np.ndarray:
+    """An example array of one case; robots lead where there are any."""
+    stored = method.finished[0].examples[name]
+    return stored[case] if robot is None else stored[robot, case]
+
+
+def _path(method: Method, robot: int | None, case: int, shown: list[str], *, replay: bool) -> Path:
+    planned, replayed = (_of(method, name, robot, case)[0, :, :2] for name in ("states", "rollout_states"))
+    return Path(method_name(method.axes, shown), method.axes, planned, replayed if replay else None)
+
+
+def _scene(method: Method, robot: int | None, case: int) -> tuple[Scene, np.ndarray]:
+    optimum = _of(method, "reference_states", robot, case)
+    environment = _of(method, "environment", robot, case)
+    task = method.finished[0].record["config"]["task"]
+    if "max_waypoints" in task:
+        e = decode(environment[None], int(task["horizon"]), int(task["max_waypoints"]))
+        discs = np.column_stack([e.centre[0], e.radius[0]])[e.present[0]]
+        return Scene(e.waypoint[0][e.due[0]], e.target, discs), optimum[:, :2]
+    target = environment[optimum.shape[-1] :][:2]
+    return Scene(np.empty((0, 2)), target[None], np.empty((0, 3))), optimum[:, :2]

@@ -1,0 +1,71 @@
+"""Two metrics of every method against each other: time against error, plan against replay."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from matplotlib.figure import Figure
+
+from dadiff.reporting.aggregation import Evidence, Method, case_scalars, has_metric, varying, weights_for
+from dadiff.reporting.figures.style import PANEL_WIDTH, legend_below, log_axis, look_of, panels
+from dadiff.reporting.labels import method_name, metric_name
+from dadiff.reporting.selection import Selector
+from dadiff.reporting.statistics import Estimate, mean
+
+
+@dataclass(frozen=True)
+class Point:
+    """One method."""
+
+    label: str
+    axes: dict[str, Any]
+    x: Estimate
+    y: Estimate
+
+
+@dataclass(frozen=True)
+class Scatter:
+    """What the figure shows; `diagonal`: a line on which both metrics agree."""
+
+    x: str
+    y: str
+    points: list[Point]
+    diagonal: bool
+    runs: list[str]
+    notes: list[str]
+
+    def draw(self, columns: int) -> Figure:
+        """One panel with both axes logarithmic."""
+        figure, (ax,) = panels(
+            1, columns, width=5.2 if columns > 1 else PANEL_WIDTH, height=3.3 + 0.1 * len(self.points)
+        )
+        for point in self.points:
+            look = look_of(point.axes)
+            bars = [[[e.value - e.low], [e.high - e.value]] for e in (point.x, point.y)]
+            ax.errorbar(point.x.value, point.y.value, xerr=bars[0], yerr=bars[1], fmt=look.marker, color=look.colour,
+                        mfc=look.fill, ms=7, capsize=2, lw=1, label=point.label)  # fmt: skip
+        if self.diagonal:
+            ends = [end([e.value for p in self.points for e in (p.x, p.y)]) for end in (min, max)]
+            ax.plot(ends, ends, color="#888888", lw=0.8, ls=":", zorder=0)
+        log_axis(ax, "x")
+        log_axis(ax, "y")
+        ax.set_xlabel(metric_name(self.x))
+        ax.set_ylabel(metric_name(self.y))
+        legend_below(figure, [ax])
+        return figure
+
+
+def collect(evidence: Evidence, *, x: str, y: str, cells: Selector, diagonal: bool = False) -> Scatter:
+    """Means of two metrics over replicates, cases and plans."""
+    methods = evidence.methods(cells)
+    alive = [m for m in methods if m.finished and has_metric(m.finished, x) and has_metric(m.finished, y)]
+    shown = varying(methods)
+    points = [Point(method_name(m.axes, shown), m.axes, _mean(m, x), _mean(m, y)) for m in alive]
+    notes = [f"{method_name(m.axes, shown)}: {m.outcome}" for m in methods if m.lost]
+    return Scatter(x, y, points, diagonal, [key for m in alive for key in m.keys], notes)
+
+
+def _mean(method: Method, metric: str) -> Estimate:
+    values = case_scalars(method.finished, metric)
+    return mean(values, weights_for(values.shape))

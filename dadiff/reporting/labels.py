@@ -1,0 +1,106 @@
+"""How methods, metrics and numbers are called in print: the same words everywhere in a report."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+PROJECTORS = {
+    "none": "vanilla",
+    "known": "known FF†",
+    "hankel": "Hankel HH†",
+    "hankel_lowrank": "Hankel, truncated",
+    "identified": "identified (A, B)",
+    "rollout": "roll-out",
+}
+ENFORCEMENTS = {
+    "none": "none",
+    "post_hoc": "once at the end",
+    "normalised": "every step",
+    "convex": "convex",
+    "clean_estimate": "clean estimate",
+    "literal": "as printed",
+}
+SYMBOLS = {"recording.length": "S", "recording.process_noise": "σ_Γ", "system.process_noise": "σ_w"}
+METRICS = {
+    "planned_state_error": "state error ‖x(t) − x*(t)‖²",
+    "planned_input_error": "control error ‖u(t) − u*(t)‖²",
+    "rollout_state_error": "state error after replay",
+    "gap": "gap of plan and replay",
+    "dynamics_residual": "dynamics residual",
+    "initial_state_error": "error of x(0)",
+    "cost_ratio": "cost / optimal cost",
+    "principal_angle": "largest principal angle [rad]",
+    "sampling_seconds": "sampling time [s]",
+    "projection_seconds": "time per projection [s]",
+    "projector_setup_seconds": "projector set-up [s]",
+    "network_calls": "network calls",
+    "collision_rollout": "share in collision after replay",
+    "collision_planned": "share in collision, as planned",
+    "waypoint_distance_1": "distance to waypoint 1",
+    "waypoint_distance_2": "distance to waypoint 2",
+    "side_agreement": "same side as the expert",
+}
+SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+def metric_name(metric: str) -> str:
+    """A metric in words."""
+    return METRICS.get(metric, metric.replace("_", " "))
+
+
+def axis_name(axis: str) -> str:
+    """An axis as a short symbol, or its last name."""
+    return SYMBOLS.get(axis, axis.split(".")[-1].replace("_", " "))
+
+
+def method_name(axes: Mapping[str, Any], shown: Iterable[str] = ()) -> str:
+    """A method by its projector, and by those of the axes in `shown` that it has.
+
+    Example:
+        >>> method_name({"projector": "hankel", "recording.length": 100}, ["recording.length"])
+        'Hankel HH†, S = 100'
+    """
+    projector = str(axes.get("projector", "?"))
+    words = [PROJECTORS.get(projector, projector)]
+    for axis in shown:
+        if axis in axes and axis != "projector" and axes[axis] is not None:
+            words.append(axis_value(axis, axes[axis]))
+    return ", ".join(word for word in words if word)
+
+
+def axis_value(axis: str, value: Any) -> str:
+    """One condition in words, for example `S = 100` or `every step`."""
+    if axis == "projector":
+        return PROJECTORS.get(str(value), str(value))
+    if axis == "enforcement":
+        return ENFORCEMENTS.get(str(value), str(value))
+    if axis == "initial_state":
+        return {"fixed": "x(0) fixed", "free": "x(0) free"}.get(str(value), str(value))
+    if axis in ("task", "sampler", "denoiser"):
+        return str(value)
+    return f"{axis_name(axis)} = {format(value, 'g') if isinstance(value, float) else value}"
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """A number to three significant digits; very large and very small ones with a power of ten.
+
+    Example:
+        >>> number(0.123456), number(1.5e-7), number(float("nan"))
+        ('0.123', '1.50·10⁻⁷', '–')
+    """
+    if value is None or math.isnan(value):
+        return "–"
+    if math.isinf(value):
+        return "∞" if value > 0 else "−∞"
+    if value == 0 or 1e-3 <= abs(value) < 1e4:
+        decimals = 0 if value == 0 else max(digits - 1 - math.floor(math.log10(abs(value))), 0)
+        return f"{value:.{decimals}f}".replace("-", "−")
+    mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
+    return f"{mantissa}·10{str(int(exponent)).translate(SUPERSCRIPT)}".replace("-", "−")
+
+
+def with_interval(value: float, low: float, high: float) -> str:
+    """A value and its 95 % interval."""
+    return f"{number(value)} [{number(low)}, {number(high)}]"

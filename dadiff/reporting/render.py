@@ -1,0 +1,137 @@
+"""Writes a report: index.html with figures inlined, tables as csv and tex, figures as files, and report.json.
+
+The same report gives the same bytes: nothing says when it was written.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import numpy as np
+from markupsafe import Markup
+
+from dadiff.errors import StoreError
+from dadiff.reporting import labels
+from dadiff.reporting.definitions import folder as definitions_folder
+from dadiff.reporting.figures.style import INK, Drawable
+from dadiff.reporting.figures.style import render as render_figure
+from dadiff.reporting.latex import to_latex
+from dadiff.reporting.report import Part, Report
+from dadiff.reporting.tables import to_csv
+from dadiff.store.files import make_folder, strict
+
+FORMAT = 1
+WIDE, NARROW = 2, 1
+"""Columns of panels on a page or screen, and on a phone."""
+
+
+def render(report: Report, folder: Path) -> Path:
+    """Write all files of a report; the path of its index.html.
+
+    Raises:
+        StoreError: if the folder cannot be written to.
+    """
+    for part in ("tables", "figures"):
+        make_folder(folder / part)
+    try:
+        _write_tables(report, folder / "tables")
+        _write_figures(report, folder / "figures")
+        (folder / "report.json").write_text(json.dumps(numbers(report), indent=1, allow_nan=False) + "\n", "utf-8")
+        (folder / "index.html").write_text(to_html(report), "utf-8")
+    except OSError as error:
+        raise StoreError(f"{folder}: cannot be written ({error.strerror}); choose another --out") from None
+    return folder / "index.html"
+
+
+def _write_tables(report: Report, folder: Path) -> None:
+    for part in report.tables:
+        if not part.empty:
+            (folder / f"{part.item.id}.csv").write_text(to_csv(part.content), "utf-8")
+            text = to_latex(part.content, f"{part.item.title}. {part.facts}", part.item.id)
+            (folder / f"{part.item.id}.tex").write_text(text, "utf-8")
+
+
+def _write_figures(report: Report, folder: Path) -> None:
+    for part in report.figures:
+        for form in () if part.empty else ("pdf", "svg", "png"):
+            (folder / f"{part.item.id}.{form}").write_bytes(render_figure(part.content, form, WIDE))
+
+
+def numbers(report: Report) -> dict[str, Any]:
+    """Every number shown, with the keys of its runs, as plain data."""
+    sweep = report.evidence.sweep
+    cells = [{"key": c.key, "name": c.name, "status": c.status, "outcome": c.outcome} for c in sweep.cells]
+    content = {
+        "format": FORMAT,
+        "sweep": sweep.name,
+        "definition": report.definition.name,
+        "commands": [sweep.command, report.command],
+        "cells": cells,
+        "duplicates": [[cell.key for cell in group] for group in sweep.duplicates],
+        "claims": [_plain(verdict) for verdict in report.verdicts],
+        "tables": {part.item.id: _part(part) for part in report.tables},
+        "figures": {part.item.id: _part(part) for part in report.figures},
+    }
+    return strict(content)  # type: ignore[no-any-return]
+
+
+def _part(part: Part) -> dict[str, Any]:
+    shown = {"title": part.item.title, "facts": part.facts, "notes": part.notes, "runs": part.runs}
+    return {**shown, "content": _plain(part.content)}
+
+
+def _plain(value: Any) -> Any:
+    if dataclasses.is_dataclass(value):
+        return {field.name: _plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    if isinstance(value, dict):
+        return {name: _plain(part) for name, part in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(part) for part in value]
+    return value.tolist() if isinstance(value, np.ndarray) else value
+
+
+def to_html(report: Report) -> str:
+    """The page: one file that asks for nothing else. Whatever comes from a store is escaped."""
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(definitions_folder() / "templates"),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=jinja2.StrictUndefined,
+    )
+    environment.filters |= {"number": labels.number, "metric": labels.metric_name, "estimate": _estimate}
+    environment.globals |= {"drawing": _drawing}
+    return environment.get_template("report.html").render(report=report, sweep=report.evidence.sweep)
+
+
+def _estimate(estimate: Any) -> str:
+    return labels.with_interval(estimate.value, estimate.low, estimate.high) if estimate else "–"
+
+
+def _drawing(part: Part) -> Markup:
+    """The figure as inline SVG, for wide pages and for phones; once if both are the same."""
+    wide, narrow = (inline_svg(part.content, part.item.title, f"{part.item.id}-{c}", c) for c in (WIDE, NARROW))
+    if wide.replace(f"{part.item.id}-{WIDE}", f"{part.item.id}-{NARROW}") == narrow:
+        return Markup('<div class="drawing">{}</div>').format(Markup(wide))
+    return Markup('<div class="drawing wide">{}</div><div class="drawing narrow">{}</div>').format(
+        Markup(wide), Markup(narrow)
+    )
+
+
+def inline_svg(plotted: Drawable, title: str, prefix: str, columns: int) -> str:
+    """SVG for the inside of a page: ids of its own, the page's text colour, as wide as its place at most."""
+    svg = render_figure(plotted, "svg", columns).decode()
+    svg = svg[svg.index("<svg") :]
+    svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
+    svg = re.sub(r'\bid="([^"]+)"', rf'id="{prefix}-\1"', svg)
+    svg = re.sub(r'(href="#|url\(#)', rf"\1{prefix}-", svg)
+    svg = re.sub(INK, "currentColor", svg, flags=re.IGNORECASE)
+    label = str(Markup.escape(title))
+    width = float(re.search(r'width="([\d.]+)pt"', svg)[1]) * 4 / 3  # type: ignore[index]
+    size = rf'<svg role="img" aria-label="{label}" style="width:100%;max-width:{width:.0f}px;height:auto"'
+    return re.sub(r"<svg", lambda _: size, re.sub(r' (width|height)="[\d.]+pt"', "", svg, count=2), count=1)

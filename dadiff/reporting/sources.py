@@ -1,0 +1,133 @@
+"""Reads a sweep back: its cells, and for each what became of it.
+
+A cell is `finished`, `diverged`, `failed`, ... as its run says, or `missing` when no run was stored.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from dadiff.errors import StoreError
+from dadiff.store import Results, StoredRun, Sweeps
+
+
+@lru_cache(maxsize=64)
+def _table(folder: Path, name: str) -> pd.DataFrame:
+    return StoredRun(folder, {"status": "finished"}).table(name)
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One cell of a sweep, with its stored run if there is one.
+
+    Args:
+        key: hash of what determines the result.
+        name: for people.
+        axes: flat parameters; those that are null do not apply.
+        run: None if nothing was stored.
+        waiting: what the sweep's record says of a cell without a run.
+    """
+
+    key: str
+    name: str
+    axes: dict[str, Any]
+    run: StoredRun | None = field(repr=False)
+    waiting: str | None = None
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """The content of `run.json`; empty if nothing was stored."""
+        return self.run.record if self.run else {}
+
+    @property
+    def status(self) -> str:
+        """What became of it; `missing` if nothing was stored."""
+        return self.run.status if self.run else "missing"
+
+    @property
+    def outcome(self) -> str:
+        """The status in words, with step or reason."""
+        reason = self.record.get("reason") or self.waiting
+        if self.status == "diverged" and self.record.get("diverged_step") is not None:
+            return f"diverged at step {self.record['diverged_step']}"
+        return f"{self.status}: {reason}" if reason else self.status
+
+    @property
+    def metrics(self) -> dict[str, float]:
+        """Headline scalars."""
+        return self.run.metrics if self.run else {}
+
+    def has(self, table: str) -> bool:
+        """Whether the run holds this table."""
+        return self.run is not None and self.run.has(table)
+
+    def table(self, name: str) -> pd.DataFrame:
+        """The stored table `per_step`, `per_plan` or `chain`.
+
+        Raises:
+            StoreError: if it is absent or damaged.
+        """
+        if self.run is None:
+            raise StoreError(f"run {self.key} ({self.name}): was not stored; run the sweep again")
+        return _table(self.run.folder, name)
+
+    @cached_property
+    def examples(self) -> dict[str, np.ndarray]:
+        """Trajectories of the first cases, by name; empty if none were stored."""
+        return self.run.arrays() if self.run else {}
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """Cells that were asked for together, and the command that asks for them again."""
+
+    name: str
+    command: str
+    cells: list[Cell]
+
+    @property
+    def finished(self) -> list[Cell]:
+        """Cells with results."""
+        return [cell for cell in self.cells if cell.status == "finished"]
+
+    @cached_property
+    def duplicates(self) -> list[list[Cell]]:
+        """Groups of cells that resolved to the same configuration."""
+        groups: dict[str, list[Cell]] = {}
+        for cell in self.cells:
+            same = json.dumps(cell.record["config"], sort_keys=True) if "config" in cell.record else cell.key
+            groups.setdefault(same, []).append(cell)
+        return [group for group in groups.values() if len(group) > 1]
+
+
+def read_sweeps(output_dir: Path, names: list[str]) -> Sweep:
+    """One sweep, or several as one, from the results folder.
+
+    Raises:
+        StoreError: if a sweep is not there, or a file is damaged or too new.
+    """
+    sweeps = [_read(output_dir, name) for name in names]
+    commands = dict.fromkeys(sweep.command for sweep in sweeps)
+    return Sweep("+".join(names), " && ".join(commands), [cell for sweep in sweeps for cell in sweep.cells])
+
+
+def _read(output_dir: Path, name: str) -> Sweep:
+    sweeps, results = Sweeps(output_dir), Results(output_dir)
+    if name not in sweeps.names():
+        raise StoreError(
+            f"{sweeps.root}: holds no sweep {name!r}; found {', '.join(sweeps.names()) or 'none'}; "
+            f"run `dadiff +sweeps={name}` or give another --output-dir"
+        )
+    stored, cells = sweeps.read(name), []
+    for cell in stored.cells:
+        run = results.read(cell.key) if results.status(cell.key) else None
+        waiting = cell.reason or (cell.status if cell.status != "waiting" else None)
+        cells.append(Cell(cell.key, cell.name, {**cell.axes, **(run.axes if run else {})}, run, waiting))
+    return Sweep(stored.name, stored.command, cells)

@@ -1,0 +1,100 @@
+"""Tables, a row a method: for each metric the mean, the interquartile mean and a paired comparison, with intervals."""
+
+from __future__ import annotations
+
+import csv
+import io
+from dataclasses import dataclass
+from typing import Any
+
+from dadiff.reporting.aggregation import Evidence, Method, case_scalars, has_metric, pair, varying, weights_for
+from dadiff.reporting.labels import method_name
+from dadiff.reporting.selection import Selector
+from dadiff.reporting.statistics import Estimate, difference, interquartile_mean, mean, ratio
+
+
+@dataclass(frozen=True)
+class Value:
+    """One metric of one method; the comparisons are paired, and None without a baseline."""
+
+    mean: Estimate
+    middle: Estimate
+    ratio: Estimate | None
+    difference: Estimate | None
+
+
+@dataclass(frozen=True)
+class Row:
+    """One method; a metric that it does not have is None, and without results `outcome` says what happened."""
+
+    label: str
+    values: dict[str, Value | None]
+    outcome: str
+    counts: dict[str, int]
+    runs: list[str]
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows and the order of the metrics; `baseline` names what ratios are relative to."""
+
+    metrics: list[str]
+    baseline: str
+    rows: list[Row]
+
+    @property
+    def runs(self) -> list[str]:
+        """Keys of all runs behind the numbers."""
+        return [key for row in self.rows for key in row.runs]
+
+    @property
+    def notes(self) -> list[str]:
+        """What became of cells without results."""
+        return [f"{row.label}: {row.outcome}" for row in self.rows if row.outcome]
+
+
+def collect(evidence: Evidence, *, cells: Selector, metrics: list[str], relative_to: Selector | None = None) -> Table:
+    """The methods that `cells` asks for; metrics that none of them has are left out."""
+    methods = evidence.methods(cells)
+    kept = [name for name in metrics if any(m.finished and has_metric(m.finished, name) for m in methods)]
+    rows = [_row(evidence, method, kept, varying(methods), relative_to) for method in methods]
+    return Table(kept, method_name(dict(relative_to)) if relative_to else "", rows)
+
+
+def _row(evidence: Evidence, method: Method, metrics: list[str], shown: list[str], baseline: Selector | None) -> Row:
+    values: dict[str, Value | None] = {}
+    other = evidence.partner(method, baseline) if baseline and method.finished else None
+    for metric in metrics:
+        there = method.finished and has_metric(method.finished, metric)
+        values[metric] = _value(method, other, metric) if there else None
+    return Row(method_name(method.axes, shown), values, method.outcome, method.counts(), method.keys)
+
+
+def _value(method: Method, other: Method | None, metric: str) -> Value:
+    values = case_scalars(method.finished, metric)
+    weights = weights_for(values.shape)
+    average, middle = mean(values, weights), interquartile_mean(values, weights)
+    if other is None or other is method or not has_metric(other.finished, metric):
+        return Value(average, middle, None, None)
+    own, theirs = (case_scalars(cells, metric) for cells in pair(method, other))
+    weights = weights_for(own.shape)
+    return Value(average, middle, ratio(own, theirs, weights), difference(own, theirs, weights))
+
+
+def to_csv(table: Table) -> str:
+    """All numbers in full precision, a row a method."""
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
+    parts = ("mean", "middle", "ratio", "difference")
+    names = [f"{metric}_{part}{end}" for metric in table.metrics for part in parts for end in ("", "_low", "_high")]
+    writer.writerow(["method", "outcome", "counts", "runs", *names])
+    for row in table.rows:
+        counts = " ".join(f"{name}={count}" for name, count in row.counts.items())
+        numbers = [x for metric in table.metrics for part in parts for x in _numbers(row.values[metric], part)]
+        writer.writerow([row.label, row.outcome, counts, " ".join(row.runs), *numbers])
+    return buffer.getvalue()
+
+
+def _numbers(value: Value | None, part: str) -> list[Any]:
+    estimate = getattr(value, part) if value else None
+    return [estimate.value, estimate.low, estimate.high] if estimate else ["", "", ""]
