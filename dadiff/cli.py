@@ -63,11 +63,11 @@ def reported(work: Callable[[], None]) -> None:
 
 def main() -> None:
     """Entry point."""
-    # from dadiff.launching import register
+    from dadiff.launching import register
 
     os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # spinning threads slow each other on a busy machine
-    # register()
+    register()
     reported(_application)
 
 

@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from dadiff.config.build import TARGET
+from dadiff.config.build import TARGET, defaults, resolve
 from dadiff.config.settings import GROUPS, Parts, assemble, complete
 
 FORMAT = 1  # raised whenever a change moves results; see CHANGELOG
@@ -120,8 +120,17 @@ def _axes(choices: Mapping[str, str], nodes: Mapping[str, Mapping[str, Any]], pa
 
 def _name(choices: Mapping[str, str], nodes: Mapping[str, Mapping[str, Any]], parts: Parts) -> str:
     fixed = getattr(parts["projector"], "initial_state", "free") == "fixed"
-    words = [choices["task"], choices["projector"] + ("_fixed" if fixed else "")]
+    words = [_word("task", choices, nodes), _word("projector", choices, nodes) + ("_fixed" if fixed else "")]
     if "recording" in choices and "length" in nodes["recording"]:
         words += [f"S={nodes['recording']['length']}", f"w={nodes['recording']['process_noise']}"]
-    words += [choices[g] for g in ("enforcement", "denoiser", "sampler") if g in choices]
+    words += [_word(group, choices, nodes) for group in ("enforcement", "denoiser", "sampler") if group in choices]
     return "/".join([*words, f"seed={parts.settings.seed}"])
+
+
+def _word(group: str, choices: Mapping[str, str], nodes: Mapping[str, Mapping[str, Any]]) -> str:
+    """The choice of a group, with the parameters that differ from their defaults: "ddpm(last_step_noise=False)"."""
+    usual = defaults(resolve(nodes[group], group, [nodes[group][TARGET].split(".")[0]]))
+    node = {name: list(value) if isinstance(value, tuple) else value for name, value in nodes[group].items()}
+    usual = {name: list(value) if isinstance(value, tuple) else value for name, value in usual.items()}
+    changed = [f"{k}={v}" for k, v in node.items() if k in usual and v != usual[k] and k != "initial_state"]
+    return choices[group] + (f"({','.join(changed)})" if changed else "")

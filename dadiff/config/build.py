@@ -39,11 +39,13 @@ def build(node: Mapping[str, Any], where: str, trusted: Sequence[str] = ()) -> A
 def completed(node: Mapping[str, Any], where: str, trusted: Sequence[str] = ()) -> dict[str, Any]:
     """The node with every parameter that it leaves to its default, so that both spellings are one identity."""
     target = resolve(node, where, trusted)
-    given = check(node, target, where)
-    defaults = {
-        name: p.default for name, p in inspect.signature(target).parameters.items() if p.default is not p.empty
-    }
-    return {TARGET: node[TARGET], **defaults, **given}
+    return {TARGET: node[TARGET], **defaults(target), **check(node, target, where)}
+
+
+def defaults(target: Callable[..., Any]) -> dict[str, Any]:
+    """The parameters that a target does not need to be given."""
+    parameters = inspect.signature(target).parameters.items()
+    return {name: parameter.default for name, parameter in parameters if parameter.default is not parameter.empty}
 
 
 def resolve(node: Mapping[str, Any], where: str, trusted: Sequence[str] = ()) -> Callable[..., Any]:

@@ -1,0 +1,43 @@
+# Everything that a fresh clone needs Python 3.11, git and make for. Each target installs into .venv by itself.
+PYTHON ?= python3.11
+RUN := .venv/bin
+OUTPUTS ?= outputs
+export OMP_WAIT_POLICY ?= PASSIVE
+export MLFLOW_DISABLE_TELEMETRY := true
+
+.PHONY: help install report test slow lint bench clean
+
+help:
+	@echo "make report   quick comparison of projectors, and its report"
+	@echo "make test     the default test suite"
+	@echo "make slow     the tests that take long"
+	@echo "make lint     ruff and mypy"
+	@echo "make bench    the speed measurements of the README"
+
+install: .venv/installed
+
+.venv/installed: pyproject.toml constraints.txt
+	$(PYTHON) -m venv .venv
+	$(RUN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[test,lint,ipopt]'
+	@touch $@
+
+report: install
+	$(RUN)/dadiff +sweeps=lqr_quick output_dir=$(OUTPUTS)
+	$(RUN)/dadiff-report lqr_quick --output-dir $(OUTPUTS)
+
+test: install
+	OMP_NUM_THREADS=1 $(RUN)/pytest
+
+slow: install
+	OMP_NUM_THREADS=1 $(RUN)/pytest -m slow
+
+lint: install
+	$(RUN)/ruff check .
+	$(RUN)/ruff format --check .
+	$(RUN)/mypy
+
+bench: install
+	$(RUN)/python -m bench
+
+clean:
+	rm -rf .venv
