@@ -169,7 +169,9 @@ def test_batch_equals_loop(recipe, choice):
     denoiser = build(type(recipe)(**{**vars(recipe), "prediction": choice}))
     tau, E = draw(3, 2, LAYOUT.size), draw(3, 1, ENVIRONMENT_DIM, seed=1)
     together = denoiser(tau, 17, E)
-    assert together.dtype == torch.float64 and together.shape == tau.shape and not together.requires_grad
+    assert together.dtype == torch.float64
+    assert together.shape == tau.shape
+    assert not together.requires_grad
     for case in range(3):
         for sample in range(2):
             alone = denoiser(tau[case, sample], 17, E[case, 0])
@@ -227,7 +229,7 @@ def test_environment_is_standardised_and_constant_entries_stay_finite():
 
 def test_wrong_shapes_are_named():
     denoiser = build(RECIPES[1])
-    with pytest.raises(ShapeError, match="environment has 5 entries.*built for 4"):
+    with pytest.raises(ShapeError, match=r"environment has 5 entries.*built for 4"):
         denoiser(draw(LAYOUT.size), 3, draw(5))
     with pytest.raises(ShapeError, match="trajectory has 7 entries"):
         denoiser(draw(7), 3, draw(ENVIRONMENT_DIM))
@@ -278,7 +280,8 @@ def stored(tmp_path_factory) -> Path:
 def test_a_model_of_other_sizes_is_refused(stored, recipe, layout, environment_dim, schedule, text):
     with pytest.raises(CheckpointError, match=text) as caught:
         load(stored, recipe, layout, environment_dim, schedule)
-    assert "\n" not in str(caught.value) and str(stored) in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert str(stored) in str(caught.value)
 
 
 def load_small(path: Path) -> NetworkDenoiser:

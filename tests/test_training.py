@@ -154,7 +154,8 @@ def test_what_is_left_in_the_folder(tmp_path):
     tau, E = torch.ones(LAYOUT.size, dtype=torch.float64), torch.ones(3, dtype=torch.float64)
     assert torch.equal(loaded(tau, 5, E), denoiser(tau, 5, E))
     rows = read_curve(tmp_path / "a")
-    assert len(rows) == SHORT.steps and int(rows[-1]["step"]) == SHORT.steps
+    assert len(rows) == SHORT.steps
+    assert int(rows[-1]["step"]) == SHORT.steps
     assert float(rows[-1]["seconds"]) > 0
 
 
@@ -184,7 +185,7 @@ def test_a_truncated_checkpoint_is_refused(tmp_path):
         run(tmp_path / "a", augment=Interrupt(3))
     path = tmp_path / "a/checkpoint.safetensors"
     path.write_bytes(path.read_bytes()[:-10])
-    with pytest.raises(CheckpointError, match="checkpoint.safetensors.*truncated"):
+    with pytest.raises(CheckpointError, match=r"checkpoint\.safetensors.*truncated"):
         run(tmp_path / "a")
 
 
@@ -214,6 +215,8 @@ def test_impossible_training(fields, text):
 def test_learning_rate_schedules():
     training = Training(steps=1000, learning_rate=1.0, warmup=99)
     rates = [training.learning_rate_at(step) for step in range(1000)]
-    assert np.argmax(rates) == 99 and 0 < rates[0] <= 0.01 and rates[-1] < 1e-5
+    assert np.argmax(rates) == 99
+    assert 0 < rates[0] <= 0.01
+    assert rates[-1] < 1e-5
     constant = replace(training, learning_rate_schedule="constant")
     assert constant.learning_rate_at(99) == constant.learning_rate_at(999) == 1

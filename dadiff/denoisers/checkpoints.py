@@ -6,7 +6,6 @@ Files are written beside their place and renamed: a reader finds the old one or 
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -43,7 +42,7 @@ def load(path: Path, recipe: Recipe, layout: Layout, environment_dim: int, sched
 
 def write(path: Path, tensors: Mapping[str, Tensor], description: Description) -> None:
     """Store named tensors and their description, by renaming a whole file into place."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    temporary = path.with_name(f".{path.name}.partial")  # one name: what a killed writer left is overwritten
     contiguous = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     save_file(contiguous, temporary, metadata={"dadiff": json.dumps(description)})
     temporary.replace(path)

@@ -67,19 +67,13 @@ class ResidualNetwork(nn.Module):
         return self.output(self.blocks(hidden))
 
 
-class Convolution(nn.Module):
+def convolution(channels_in: int, channels_out: int, kernel: int) -> nn.Conv2d:
     """A convolution over time, (B, C, 1, T+1) to (B, C', 1, T+1).
 
     One-dimensional, but written as a (1, kernel) Conv2d: on a CPU in channels-last memory it runs at the speed of
     a plain matrix product, where Conv1d does not.
     """
-
-    def __init__(self, channels_in: int, channels_out: int, kernel: int) -> None:
-        super().__init__()
-        self.conv = nn.Conv2d(channels_in, channels_out, (1, kernel), padding=(0, kernel // 2))
-
-    def forward(self, signal: Tensor) -> Tensor:
-        return self.conv(signal)
+    return nn.Conv2d(channels_in, channels_out, (1, kernel), padding=(0, kernel // 2))
 
 
 class EncoderDecoderNetwork(nn.Module):
@@ -93,23 +87,12 @@ class EncoderDecoderNetwork(nn.Module):
         self.layout, self.channels, self.length = layout, channels, layout.horizon + 1
         features = layout.state_dim + layout.input_dim
         self.condition = Condition(environment_dim, channels)
-        self.encoder = nn.ModuleList(
-            [
-                Convolution(features, channels, kernel),
-                Convolution(channels, channels, kernel),
-                Convolution(channels, channels, kernel),
-            ]
-        )
+        hidden = (channels, channels)
+        self.encoder = nn.ModuleList(convolution(*c, kernel) for c in ((features, channels), hidden, hidden))
         self.to_latent = nn.Linear(channels * self.length, latent_dim)
         self.latent_condition = nn.Linear(channels, latent_dim)
         self.from_latent = nn.Linear(latent_dim, channels * self.length)
-        self.decoder = nn.ModuleList(
-            [
-                Convolution(channels, channels, kernel),
-                Convolution(channels, channels, kernel),
-                Convolution(channels, features, kernel),
-            ]
-        )
+        self.decoder = nn.ModuleList(convolution(*c, kernel) for c in (hidden, hidden, (channels, features)))
 
     def forward(self, tau: Tensor, step: Tensor, environment: Tensor) -> Tensor:
         condition = self.condition(step, environment)

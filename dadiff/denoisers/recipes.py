@@ -113,8 +113,8 @@ class Gaussian:
 
     trainable: ClassVar[bool] = False
 
-    def exact(self, law: Law, coordinates: Coordinates, schedule: Schedule) -> ExactDenoiser:
+    def exact(self, law: Law, coordinates: Coordinates, schedule: Schedule, device: str = "cpu") -> ExactDenoiser:
         """The denoiser of one law, in the coordinates in which the sampler works."""
         from dadiff.denoisers.exact import ExactDenoiser
 
-        return ExactDenoiser(law, coordinates, schedule)
+        return ExactDenoiser(law, coordinates, schedule, device)
