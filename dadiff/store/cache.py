@@ -90,7 +90,7 @@ class Cache:
 
     def entries(self) -> Iterator[Entry]:
         """Every folder in the cache, whole or not."""
-        for folder in sorted(self.root.glob("[!.]*/*/")):
+        for folder in sorted(self.root.glob("[!.]*/[!.]*/")):
             kind, key = folder.parent.name, folder.name.split(".")[0]
             size = sum(path.stat().st_size for path in files_in(folder))
             yield Entry(kind, key, folder, self._state(folder, kind, key), size)

@@ -1,0 +1,148 @@
+"""Laws of sweeps: each key once, what is shared is built once, what is done is left alone, what failed is done again."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+
+from dadiff.config.composed import plain
+from dadiff.folders import shipped
+from dadiff.launching import register
+from dadiff.launching.outcome import Outcome, why
+from dadiff.launching.plan import describe, make_plan
+from dadiff.launching.sweep import SweepRun, summary
+from dadiff.store import Cache, Results, Sweeps
+from dadiff.sync import sync
+from dadiff.tracking import is_tracked
+from dadiff.tracking.client import open_client
+
+TINY = [
+    "dataset.train_size=60", "dataset.test_size=2", "evaluation.samples=2", "sampler=ddim", "sampler.num_steps=4",
+    "denoiser.width=8", "denoiser.blocks=1", "training.steps=3", "training.warmup=1", "training.batch_size=8",
+    "device=cpu", "progress=false",
+]  # fmt: skip
+CELLS = [
+    ["projector=known"],
+    ["projector=none", "enforcement=normalised"],
+    ["projector=none", "enforcement=convex"],  # the same run: nothing is projected
+    ["projector=hankel", "recording.length=20"],  # too short
+]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _registered():
+    register()
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    return tmp_path_factory.mktemp("outputs")
+
+
+def configs(root: Path, cells: Sequence[Sequence[str]] = CELLS) -> list[dict]:
+    with initialize_config_dir(str(shipped("conf").absolute()), version_base="1.3"):
+        composed = [compose("config", [*TINY, *cell, f"output_dir={root}"], return_hydra_config=True) for cell in cells]
+        return [plain(config, config.hydra.runtime.choices) for config in composed]
+
+
+def run_here(run: SweepRun) -> dict[str, Outcome]:
+    """Do the sweep's work in this process, as the launcher's pool does it in others."""
+    cells = {cell.identity.key: cell for cell in run.plan.cells}
+    parent, outcomes = run.open(), {}
+    for work in run.works(parent):
+        try:
+            work.function(*work.arguments)
+            outcomes[work.key] = Outcome("finished", None, 0.0)
+        except Exception as error:
+            outcomes[work.key] = Outcome(*why(error), 0.0)
+        if work.key in cells:
+            run.ended(cells[work.key], outcomes[work.key])
+    run.close(parent, outcomes, interrupted=False)
+    return outcomes
+
+
+@pytest.fixture(scope="module")
+def first(root):
+    run = SweepRun.of(make_plan(configs(root)), "quick", "dadiff +sweeps=quick", {"projector": "known,none,hankel"})
+    return run, run_here(run)
+
+
+def test_a_plan_has_each_key_once_and_builds_what_is_shared_first(tmp_path):
+    plan = make_plan(configs(tmp_path))
+    assert [cell.copies for cell in plan.cells] == [1, 2, 1]
+    assert [p.artefact.kind for p in plan.preparations] == ["dataset", "denoiser"]
+    dataset, denoiser = (p.artefact.key for p in plan.preparations)
+    assert plan.preparations[1].needs == {dataset}
+    assert plan.needs(plan.cells[0]) == {dataset, denoiser}
+    text = describe(plan)
+    assert "3 cells, 0 done, 3 to run" in text
+    assert "(2 cells of the sweep)" in text
+    assert f"denoiser {denoiser} is shared by 3 cells" in text
+    assert f"would train denoiser {denoiser}" in text
+
+
+def test_what_succeeds_is_stored_and_what_fails_is_recorded_with_its_reason(first, root):
+    run, outcomes = first
+    sweep = Sweeps(root).read("quick")
+    assert [cell.status for cell in sweep.cells] == ["finished", "finished", "failed"]
+    assert "S" in sweep.cells[2].reason
+    failed = Results(root).read(sweep.cells[2].key)
+    assert (failed.status, failed.record["reason"]) == ("failed", sweep.cells[2].reason)
+    assert [entry.kind for entry in Cache(root).entries()] == ["dataset", "denoiser"]
+    assert len(outcomes) == 5
+    text = summary(sweep, 0, run.folder)
+    assert "2 finished, 1 failed" in text
+    assert "dadiff +sweeps=quick" in text
+
+
+def test_mlflow_shows_the_sweep_its_runs_and_the_training(first, root):
+    run, _ = first
+    client, experiment = open_client(run.tracking.uri), run.tracking._experiment_id
+    mirrors = {r.info.run_name: r for r in client.search_runs([experiment])}
+    kinds = sorted(mirror.data.tags["kind"] for mirror in mirrors.values())
+    assert kinds == ["run", "run", "run", "sweep", "training"]
+    assert {mirror.info.status for mirror in mirrors.values()} == {"FINISHED", "FAILED"}
+    parent = mirrors["quick"].info.run_id
+    children = [m for m in mirrors.values() if m.data.tags["kind"] == "run"]
+    assert {child.data.tags["mlflow.parentRunId"] for child in children} == {parent}
+    training = next(m for m in mirrors.values() if m.data.tags["kind"] == "training")
+    finished = [child for child in children if child.info.status == "FINISHED"]
+    assert {child.data.tags["link.denoiser"] for child in finished} == {training.data.tags["key"]}
+
+
+def test_a_rerun_does_only_what_failed(first, root):
+    run = SweepRun.of(make_plan(configs(root)), "quick", "dadiff", {})
+    assert [cell.identity.name.split("/")[1] for cell in run.plan.waiting] == ["hankel"]
+    assert run.plan.preparations == []
+    assert len(run.works(None)) == 1
+    assert not run.is_over()
+
+
+def test_a_sweep_whose_cells_are_done_is_over(first, root):
+    run = SweepRun.of(make_plan(configs(root, CELLS[:3])), "over", "dadiff", {})
+    assert not run.is_over()  # its record is not written yet
+    assert run_here(run) == {}
+    again = SweepRun.of(make_plan(configs(root, CELLS[:3])), "over", "dadiff", {})
+    assert again.is_over()
+    forced = make_plan(configs(root, [[*CELLS[0], "force=true"]]))
+    assert len(forced.waiting) == 1
+
+
+def test_sync_uploads_to_another_store_what_is_missing(first, root, tmp_path):
+    uri = f"sqlite:///{tmp_path}/other.db"
+    assert sync(root, uri) == (2, 0)
+    assert sync(root, uri) == (0, 0)
+    assert all(is_tracked(run.folder, uri) for run in Results(root) if run.status == "finished")
+
+
+def test_plans_are_made_without_torch_and_mlflow():
+    code = (
+        "import sys, dadiff.launching.processes, dadiff.launching.plan; "
+        "sys.exit('torch' in sys.modules or 'mlflow' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
