@@ -6,7 +6,9 @@ Files are read without pickle, so nothing in them is executed. Every complaint n
 from __future__ import annotations
 
 import hashlib
+import tokenize
 import zipfile
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +20,11 @@ from dadiff.systems import LinearSystem, Recording
 from dadiff.tasks import Cases, Demonstrations, Task
 
 INPUT_NAMES = ("inputs", "controls")
+# What zipfile and numpy raise on damaged, encrypted or unknown content, and on pickled objects.
+UNREADABLE = (
+    *(OSError, EOFError, ValueError, SyntaxError, RuntimeError),
+    *(zipfile.BadZipFile, zlib.error, tokenize.TokenError),
+)
 
 
 def list_files(folder: Path) -> list[Path]:
@@ -54,22 +61,28 @@ def read_array(file: Path, names: Sequence[str], shape: tuple[int | None, ...]) 
         DataError: if it is missing, holds objects, has another shape, or values that are not finite.
     """
     label = " or ".join(names)
-    try:
-        with np.load(file, allow_pickle=False) as archive:
-            present = [name for name in names if name in archive]
-            if not present:
-                raise DataError(f"{file}: has no array {label}; found {', '.join(archive.files) or 'none'}")
-            array = np.asarray(archive[present[0]], dtype=np.float64)
-    except (zipfile.BadZipFile, OSError, EOFError) as error:
-        raise DataError(f"{file}: is not a readable .npz file ({error})") from error
-    except ValueError as error:
-        raise DataError(f"{file}: array {label} does not hold plain numbers ({error})") from error
+    array = _first_of(file, names, label)
+    if array.dtype.kind not in "fiu":
+        raise DataError(f"{file}: array {label} holds {array.dtype}; expected real numbers")
     expected = "(" + ", ".join("any" if k is None else str(k) for k in shape) + ")"
     if array.ndim != len(shape) or any(k not in (None, size) for k, size in zip(shape, array.shape, strict=True)):
         raise DataError(f"{file}: array {label} has shape {array.shape}; expected {expected}")
     if not np.isfinite(array).all():
         raise DataError(f"{file}: array {label} holds a value that is not finite")
-    return array
+    return array.astype(np.float64)
+
+
+def _first_of(file: Path, names: Sequence[str], label: str) -> np.ndarray:
+    if not zipfile.is_zipfile(file):
+        raise DataError(f"{file}: is not a readable .npz file; write it with numpy.savez")
+    try:
+        with np.load(file, allow_pickle=False) as archive:
+            present = [name for name in names if name in archive.files]
+            if not present:
+                raise DataError(f"{file}: has no array {label}; found {', '.join(archive.files) or 'none'}")
+            return np.asarray(archive[present[0]])
+    except UNREADABLE as error:
+        raise DataError(f"{file}: array {label} cannot be read ({error})") from error
 
 
 @dataclass(frozen=True)
@@ -105,6 +118,8 @@ class NpzTrajectories:
         return Cases(environment, environment[:, : system.state_dim], tau)
 
     def _read(self, part: str, task: Task, system: LinearSystem, count: int | None) -> tuple[np.ndarray, np.ndarray]:
+        if not isinstance(system, LinearSystem) or system.robots:
+            raise ConfigError("dataset: npz trajectories belong to one system, and here are several robots")
         n, m, T = system.state_dim, system.input_dim, task.horizon
         if task.environment_dim(system) != 2 * n:
             raise ConfigError(
@@ -122,6 +137,8 @@ class NpzTrajectories:
 class NpzRecordings:
     """Own recordings Γ: a folder of .npz files with `states (S+1, n)` and `inputs` or `controls (S, m)`, equal in S.
 
+    Of a fleet, one such folder a robot: `path`/robot_0, robot_1, ...
+
     Args:
         path: the folder.
     """
@@ -137,14 +154,33 @@ class NpzRecordings:
         """All files side by side.
 
         Raises:
-            DataError: if a file's sizes disagree with the system or with the first file.
+            DataError: if a file's sizes disagree with the system or with the first file; if a robot has no folder,
+                or another number or length of recordings than the first one.
         """
-        if system.robots:
-            raise ConfigError("recording: npz recordings belong to one system, and here are several robots")
-        files = list_files(Path(self.path))
+        if not system.robots:
+            return self._read(Path(self.path), system)
+        folders = [Path(self.path) / f"robot_{k}" for k in range(len(system.A))]
+        if missing := [folder.name for folder in folders if not folder.is_dir()]:
+            raise DataError(
+                f"{self.path}: no recordings for {', '.join(missing)}; expected one folder for each of "
+                f"{len(folders)} robots"
+            )
+        recordings = [self._read(folder, system) for folder in folders]
+        for folder, recording in zip(folders, recordings, strict=True):
+            if recording.inputs.shape != recordings[0].inputs.shape:
+                raise DataError(
+                    f"{folder}: holds {recording.count} recordings with S = {recording.length}, {folders[0].name} "
+                    f"{recordings[0].count} with {recordings[0].length}; cut to equal number and S"
+                )
+        return Recording(*(np.stack([getattr(r, part) for r in recordings]) for part in ("states", "inputs")))
+
+    def _read(self, folder: Path, system: LinearSystem) -> Recording:
+        files = list_files(folder)
         inputs = [read_array(f, INPUT_NAMES, (None, system.input_dim)) for f in files]
         for file, u in zip(files, inputs, strict=True):
             if len(u) != len(inputs[0]):
-                raise DataError(f"{file}: has S = {len(u)} inputs, {files[0].name} has {len(inputs[0])}; cut to equal S")
+                raise DataError(
+                    f"{file}: has S = {len(u)} inputs, {files[0].name} has {len(inputs[0])}; cut to equal S"
+                )
         states = [read_array(f, ["states"], (len(inputs[0]) + 1, system.state_dim)) for f in files]
         return Recording(np.stack(states), np.stack(inputs))

@@ -67,7 +67,9 @@ def sample(
         return torch.randn(shape, generator=generator, dtype=torch.float64).to(environment.device)
 
     tau, calls = noise(), 0
-    for step in tqdm(sampler.steps(schedule), desc="sampling", unit="step", disable=None if progress else True, leave=False):
+    for step in tqdm(
+        sampler.steps(schedule), desc="sampling", unit="step", disable=None if progress else True, leave=False
+    ):
         mean = step.sample * tau
         if step.call:
             tau0_hat, calls = denoise(tau, step.i, environment), calls + 1

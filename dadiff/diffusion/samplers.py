@@ -7,6 +7,7 @@ everywhere, also where alpha_bar_L = 0.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from math import prod, sqrt
 from typing import Literal, Protocol
 
@@ -65,7 +66,10 @@ class DDPM:
 
     def _step(self, schedule: Schedule, i: int) -> Step:
         beta, alpha, alpha_bar, previous = (
-            schedule.beta[i], schedule.alpha[i], schedule.alpha_bar[i], schedule.alpha_bar[i - 1]
+            schedule.beta[i],
+            schedule.alpha[i],
+            schedule.alpha_bar[i],
+            schedule.alpha_bar[i - 1],
         )
         clean = sqrt(previous) * beta / (1 - alpha_bar)
         sample = sqrt(alpha) * (1 - previous) / (1 - alpha_bar)
@@ -97,7 +101,7 @@ class DDIM:
         L = schedule.num_steps
         count = min(self.num_steps, L)
         visited = [round(L * k / count) for k in range(count, -1, -1)]
-        return [self._step(schedule, i, j) for i, j in zip(visited, visited[1:], strict=False)]
+        return [self._step(schedule, i, j) for i, j in pairwise(visited)]
 
     def _step(self, schedule: Schedule, i: int, j: int) -> Step:
         alpha_bar, next_bar = schedule.alpha_bar[i], schedule.alpha_bar[j]
@@ -112,7 +116,8 @@ def _skip(steps: list[Step], bound: float) -> list[Step]:
 
     After steps 1..k that weight is W_k = sample_k W_{k-1} + clean_k.
     """
-    marked, weight = [], 0.0
+    marked: list[Step] = []
+    weight = 0.0
     for step in steps:
         weight = step.sample * weight + step.clean
         if weight > bound:
@@ -122,7 +127,7 @@ def _skip(steps: list[Step], bound: float) -> list[Step]:
 
 
 def skipped_weight(steps: list[Step]) -> float:
-    """The total weight W of skipped clean estimates: the first called step's sample is off by at most W max |tau0_hat|."""
+    """The weight W of skipped clean estimates: the sample at the first call is off by at most W max |tau0_hat|."""
     weight = 0.0
     for step in steps:
         if step.call:

@@ -37,7 +37,7 @@ class Schedule:
         if len(outside):
             i = int(outside[0])
             raise ConfigError(f"schedule: beta_{i} = {beta[i]:g} lies outside [0, 1]; lower the slope or num_steps")
-        if beta[1] == 0:
+        if 1 - beta[1] == 1:
             raise ConfigError("schedule: beta_1 = 0, so the first step adds no noise and cannot be undone; raise beta")
 
     @property
@@ -67,13 +67,20 @@ class Schedule:
         }
 
 
+def _steps(num_steps: int) -> np.ndarray:
+    """i = 1..L."""
+    if num_steps < 1:
+        raise ConfigError(f"schedule: num_steps is {num_steps}; it must be at least 1")
+    return np.arange(1, num_steps + 1)
+
+
 def _schedule(beta: np.ndarray) -> Schedule:
     return Schedule(np.concatenate([[0.0], beta]))
 
 
 def paper_linear(num_steps: int = 1000, slope: float = 0.001) -> Schedule:
     """beta_i = slope * i, the schedule of the paper's experiments (Section IV-A): L = 1000, slope 0.001."""
-    beta = slope * np.arange(1, num_steps + 1)
+    beta = slope * _steps(num_steps)
     if math.isclose(beta[-1], 1):
         beta[-1] = 1.0  # 0.001 * 1000 is 1 up to rounding; (C1) means 1
     return _schedule(beta)
@@ -81,11 +88,11 @@ def paper_linear(num_steps: int = 1000, slope: float = 0.001) -> Schedule:
 
 def ddpm_linear(num_steps: int = 1000, beta_first: float = 1e-4, beta_last: float = 0.02) -> Schedule:
     """beta_i linear from beta_first to beta_last (Ho, Jain & Abbeel 2020)."""
-    return _schedule(np.linspace(beta_first, beta_last, num_steps))
+    return _schedule(np.linspace(beta_first, beta_last, len(_steps(num_steps))))
 
 
 def cosine(num_steps: int = 1000, offset: float = 0.008, beta_max: float = 0.999) -> Schedule:
     """alpha_bar_i proportional to cos^2((i/L + s)/(1 + s) * pi/2), s = offset (Nichol & Dhariwal 2021)."""
-    i = np.arange(num_steps + 1) / num_steps
-    alpha_bar = np.cos((i + offset) / (1 + offset) * np.pi / 2) ** 2
+    share = np.concatenate([[0], _steps(num_steps)]) / num_steps
+    alpha_bar = np.cos((share + offset) / (1 + offset) * np.pi / 2) ** 2
     return _schedule(np.minimum(1 - alpha_bar[1:] / alpha_bar[:-1], beta_max))

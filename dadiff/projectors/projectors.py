@@ -36,7 +36,9 @@ class Projector(Protocol):
 
     needs: ClassVar[str | None]
 
-    def fit(self, layout: Layout, system: LinearSystem | None = None, recording: Recording | None = None) -> Fitted | None: ...
+    def fit(
+        self, layout: Layout, system: LinearSystem | None = None, recording: Recording | None = None
+    ) -> Fitted | None: ...
 
 
 @dataclass(frozen=True)
@@ -88,9 +90,9 @@ class Hankel:
         U, s, rank = _decompose(recording, layout)
         if rank == layout.size and not self.allow_identity:
             raise ExcitationError(
-                f"projector hankel: {recording.count} x S = {recording.length} noisy columns span all d = {layout.size} "
-                "dimensions, so H H† is the identity and projects nothing; use hankel_lowrank, a shorter recording, "
-                "or projector.allow_identity=true"
+                f"projector hankel: {recording.count} x S = {recording.length} noisy columns span all d = "
+                f"{layout.size} dimensions, so H H† is the identity and projects nothing; use hankel_lowrank, a "
+                "shorter recording, or projector.allow_identity=true"
             )
         return AdmissibleSet(layout, U[..., :rank], notes=_notes(s, rank)).starting(self.initial_state)
 
@@ -140,7 +142,9 @@ class RolloutProjector:
     def fit(self, layout: Layout, system: LinearSystem | None = None, recording: Recording | None = None) -> Rollout:
         """The map u -> F [x_init; u]."""
         system = _required(system, "rollout", "system")
-        return Rollout(layout, trajectory_map(system.A, system.B, layout.horizon), {"rank": layout.rank - layout.state_dim})
+        return Rollout(
+            layout, trajectory_map(system.A, system.B, layout.horizon), {"rank": layout.rank - layout.state_dim}
+        )
 
 
 def identify(recording: Recording) -> tuple[np.ndarray, np.ndarray]:

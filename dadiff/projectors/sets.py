@@ -13,7 +13,7 @@ from typing import Literal
 
 import numpy as np
 
-from dadiff.errors import ConfigError, ExcitationError
+from dadiff.errors import ConfigError, ExcitationError, ShapeError
 from dadiff.trajectory.coordinates import Coordinates, physical
 from dadiff.trajectory.layout import Array, Layout
 from dadiff.trajectory.subspace import column_basis, null_space, numerical_rank
@@ -38,7 +38,13 @@ class Projection:
 
     def __call__(self, z: Array) -> Array:
         """Project z (*robots, ..., d); numpy with numpy, torch with torch. All plans of a robot go in one product."""
-        flat = z.reshape(*self.analysis.shape[:-2], -1, z.shape[-1])
+        *robots, d, _ = self.analysis.shape
+        if (*z.shape[: len(robots)], z.shape[-1]) != (*robots, d):
+            raise ShapeError(
+                f"projection: made for trajectories of shape {(*robots, '...', d)} (robots first), found "
+                f"{tuple(z.shape)}; build the projector from these robots' systems or recordings"
+            )
+        flat = z.reshape(*robots, -1, d)
         image = (flat @ self.analysis) @ self.synthesis.swapaxes(-1, -2) + self.offset
         return image.reshape(z.shape)
 
@@ -121,7 +127,7 @@ class Rollout:
         select[self.layout.all_inputs] = np.eye(self.layout.rank - n)
         forced = self.F[..., n:]
         mean = (forced @ (select.T @ where.mean))[..., None, :]
-        analysis = np.broadcast_to(where.scale[:, None] * select, (*self.F.shape[:-2], *select.shape))
+        analysis = np.tile(where.scale[:, None] * select, (*self.F.shape[:-2], 1, 1))
         origin = _starting_at(x_init, self.F[..., :n])
         return Projection(analysis, forced / where.scale[:, None], where.to_scaled(origin + mean))
 

@@ -42,6 +42,8 @@ def double_integrator(
         time_step: in seconds.
         process_noise: standard deviation of w(t) per state and step.
     """
+    if axes < 1:
+        raise ConfigError(f"system: axes is {axes}; it must be at least 1")
     zero, one = np.zeros((axes, axes)), np.eye(axes)
     A, B = np.block([[zero, one], [zero, zero]]), np.vstack([zero, one])
     return LinearSystem(*discretise(A, B, time_step, discretisation), process_noise)

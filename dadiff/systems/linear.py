@@ -30,15 +30,17 @@ class LinearSystem:
     process_noise: float | np.ndarray = 0.0
 
     def __post_init__(self) -> None:
-        A, B = np.asarray(self.A, dtype=np.float64), np.asarray(self.B, dtype=np.float64)
+        A, B = _stacked(self.A, "A"), _stacked(self.B, "B")
         object.__setattr__(self, "A", A)
         object.__setattr__(self, "B", B)
         if A.ndim < 2 or A.shape[-1] != A.shape[-2] or B.ndim < 2 or B.shape[:-1] != A.shape[:-1]:
             raise ShapeError(f"system: A has shape {A.shape} and B {B.shape}; expected (..., n, n) and (..., n, m)")
         if not (np.isfinite(A).all() and np.isfinite(B).all()):
             raise ConfigError("system: A or B holds a value that is not finite")
-        if not (np.asarray(self.process_noise) >= 0).all():
-            raise ConfigError(f"system: process_noise is {self.process_noise}; a standard deviation is at least 0")
+        if not ((noise := np.asarray(self.process_noise)) >= 0).all() or np.isinf(noise).any():
+            raise ConfigError(
+                f"system: process_noise is {self.process_noise}; a standard deviation is finite and not negative"
+            )
 
     @property
     def state_dim(self) -> int:
@@ -70,3 +72,11 @@ class LinearSystem:
     def sample_noise(self, rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
         """w of shape (*shape, n)."""
         return self.process_noise * rng.standard_normal((*shape, self.state_dim))
+
+
+def _stacked(matrices: object, name: str) -> np.ndarray:
+    """One array from a matrix, an array of them, or a list of one a robot."""
+    shapes = {np.shape(M) for M in matrices} if isinstance(matrices, list | tuple) else set()
+    if len(shapes) > 1:
+        raise ShapeError(f"system: the robots' {name} have shapes {sorted(shapes)}; all robots must share n and m")
+    return np.asarray(matrices, dtype=np.float64)

@@ -60,8 +60,9 @@ class GaussianExcitation:
     def __post_init__(self) -> None:
         if self.length < 1 or self.count < 1:
             raise ConfigError(f"recording: length is {self.length} and count {self.count}; both must be at least 1")
-        if self.input_std < 0 or (self.process_noise is not None and self.process_noise < 0):
-            raise ConfigError("recording: input_std and process_noise are standard deviations and not negative")
+        for name in ("input_std", "process_noise"):
+            if (std := getattr(self, name)) is not None and not 0 <= std < np.inf:
+                raise ConfigError(f"recording: {name} is {std}; a standard deviation is finite and not negative")
 
     def record(self, system: LinearSystem) -> Recording:
         """Γ of every robot of the system."""

@@ -42,13 +42,14 @@ class LQR:
     def __post_init__(self) -> None:
         if self.horizon < 1:
             raise ConfigError(f"task: horizon is {self.horizon}; it must be at least 1")
-        if min(self.state_cost) < 0 or self.input_cost <= 0:
+        if not (all(0 <= q < np.inf for q in self.state_cost) and 0 < self.input_cost < np.inf):
             raise ConfigError(
                 f"task: state_cost is {list(self.state_cost)} and input_cost {self.input_cost}; "
-                "Q must not be negative and R must be positive"
+                "Q must not be negative, R must be positive, and both finite"
             )
-        if self.init_range < 0 or self.target_range < 0:
-            raise ConfigError("task: init_range and target_range must not be negative")
+        for name in ("init_range", "target_range"):
+            if not 0 <= (value := getattr(self, name)) < np.inf:
+                raise ConfigError(f"task: {name} is {value}; it must be finite and not negative")
 
     @cached_property
     def Q(self) -> np.ndarray:
@@ -93,18 +94,19 @@ class LQR:
     def demonstrations(self, system: LinearSystem, count: int, rng: np.random.Generator) -> Demonstrations:
         """`count` noisy runs of the expert, each in an environment of its own."""
         environment = self.sample_environments(system, (count,), rng)
-        return Demonstrations(self._realise(system, environment, rng), environment)
+        return Demonstrations(self.realise(system, environment, rng), environment)
 
     def cases(self, system: LinearSystem, count: int, rng: np.random.Generator) -> Cases:
         """`count` cases for each robot of the system."""
         environment = self.sample_environments(system, (*system.robots, count), rng)
         if self.reference == "realised":
-            reference = self._realise(system, environment, rng)
+            reference = self.realise(system, environment, rng)
         else:
             reference = along(self.law(system).mean_map, environment)
         return Cases(environment, environment[..., : system.state_dim], reference)
 
-    def _realise(self, system: LinearSystem, environment: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    def realise(self, system: LinearSystem, environment: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """One noisy run of the expert for each E (*robots, ..., 2n): tau of shape (*robots, ..., d)."""
         law = self.law(system)
         noise = rng.standard_normal((*environment.shape[:-1], law.noise_map.shape[-1]))
         return along(law.mean_map, environment) + along(law.noise_map, noise)
@@ -118,7 +120,7 @@ class LQR:
     def score(self, system: LinearSystem, cases: Cases, planned: np.ndarray, rollout: np.ndarray) -> Scores:
         """The cost after replay, relative to the noise-free finite-horizon optimum of the case."""
         target = cases.environment[..., system.state_dim :]
-        optimum = along(closed_loop_law(system, optimal_feedback(system, self.Q, self.R(system), self.horizon)).mean_map,
-                        cases.environment)
+        feedback = optimal_feedback(system, self.Q, self.R(system), self.horizon)
+        optimum = along(closed_loop_law(system, feedback).mean_map, cases.environment)
         ratio = self.cost(system, rollout, target[..., None, :]) / self.cost(system, optimum, target)[..., None]
         return Scores(per_plan={"cost_ratio": ratio})

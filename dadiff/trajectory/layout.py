@@ -103,7 +103,9 @@ class Layout:
             ("inputs", inputs, (self.horizon, self.input_dim)),
         ):
             if tuple(array.shape[-2:]) != expected:
-                raise ShapeError(f"{what} have shape {tuple(array.shape)}; expected (..., {expected[0]}, {expected[1]})")
+                raise ShapeError(
+                    f"{what} have shape {tuple(array.shape)}; expected (..., {', '.join(map(str, expected))})"
+                )
         return _concatenate(
             [
                 states.reshape(*states.shape[:-2], self.num_state_entries),
