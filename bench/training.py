@@ -99,7 +99,7 @@ def state_error(denoiser: NetworkDenoiser, coordinates: Coordinates, sampler: Sa
 
 
 def bench_quick(choice: str = "physical") -> None:
-    """denoiser=mlp training=quick on 10,000 LQR trajectories, process noise 0.02; error against the noise-free optimum."""
+    """denoiser=mlp training=quick on 10,000 LQR trajectories, process noise 0.02, against the noise-free optimum."""
     system = double_integrator(process_noise=0.02)
     data = LQR().demonstrations(system, 10_000, numpy_generator(0, "demonstrations"))
     coordinates = physical(LQR_LAYOUT) if choice == "physical" else standardised(LQR_LAYOUT, data.trajectories)
