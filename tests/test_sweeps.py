@@ -1,4 +1,4 @@
-"""Laws of sweeps: each key once, what is shared is built once, what is done is left alone, what failed is done again."""
+"""Laws of sweeps: each key once, what is shared built once, what is done left alone, what failed done again."""
 
 from __future__ import annotations
 

@@ -152,7 +152,7 @@ def test_a_sweep_is_one_parent_however_often_it_is_run(tracking, tmp_path):
 
 def test_a_training_is_a_run_of_its_own(tracking, tmp_path):
     def build(folder: Path) -> None:
-        pd.DataFrame({"step": [0, 100], "loss": [1.0, 0.1]}).to_parquet(folder / "history.parquet")
+        pd.DataFrame({"step": [1, 100], "loss": [1.0, 0.1]}).to_csv(folder / "training.csv", index=False)
 
     folder = Cache(tmp_path).get_or_build("denoiser", KEY, {"training": {"steps": 100}}, build)
     for _ in range(2):

@@ -14,9 +14,9 @@ from dadiff.store import Results, StoredRun, Sweep
 if TYPE_CHECKING:
     import pandas as pd
 
-INDICES = ("robot", "case", "sample", "t")
+INDICES = ("robot", "case", "sample", "t", "step")
 ALONG_TIME = "along_time/"
-ARTIFACTS = (".json", ".yaml", ".parquet", ".png", ".svg", ".pdf")
+ARTIFACTS = (".json", ".yaml", ".parquet", ".csv", ".png", ".svg", ".pdf")
 
 
 @dataclass(frozen=True)
@@ -63,16 +63,16 @@ def scalars(run: StoredRun) -> list[tuple[str, float, int]]:
 
 def curves(run: StoredRun) -> list[tuple[str, float, int]]:
     """Means over robots, cases and samples at each t."""
-    return _columns(run.table("per_step"), ALONG_TIME) if run.has("per_step") else []
+    return _columns(run.table("per_step"), "t", ALONG_TIME) if run.has("per_step") else []
 
 
-def _columns(table: pd.DataFrame, prefix: str) -> list[tuple[str, float, int]]:
+def _columns(table: pd.DataFrame, index: str, prefix: str = "") -> list[tuple[str, float, int]]:
     quantities = [name for name in table.columns if name not in INDICES]
-    means = table.groupby("t")[quantities].mean()
+    means = table.groupby(index)[quantities].mean()
     return [
-        (f"{prefix}{name}", float(value), int(t))
+        (f"{prefix}{name}", float(value), int(step))
         for name in quantities
-        for t, value in means[name].items()
+        for step, value in means[name].items()
         if math.isfinite(value)
     ]
 
@@ -90,20 +90,14 @@ def run_note(run: StoredRun) -> str:
 
 
 def training_content(manifest: dict[str, Any], folder: Path) -> Content:
-    """A cached training: its identity as parameters, its history (column `step` beside the losses) as metrics."""
+    """A cached training: its identity as parameters, its curve (`training.csv`: step, loss, ...) as metrics."""
     import pandas as pd
 
     identity = flat(manifest.get("identity", {}))
-    path = folder / "history.parquet"
+    path = folder / "training.csv"
     metrics = []
     if path.is_file():
-        history = pd.read_parquet(path).set_index("step")
-        metrics = [
-            (name, float(value), int(step))
-            for name in history.columns
-            for step, value in history[name].items()
-            if math.isfinite(value)
-        ]
+        metrics = _columns(pd.read_csv(path), "step")
     note = f"Training of the denoiser `{manifest['key']}`, shared by every run whose tag `link.denoiser` names it."
     tags = {"status": "finished", "mlflow.note.content": f"{note}\n\nThe weights lie in `{folder}`."}
     params = {name: _text(value) for name, value in identity.items()}

@@ -1,0 +1,73 @@
+"""Brings a sweep back from MLflow into the format of the results folder, for reports where only the store is at hand.
+
+Weights and arrays are not in MLflow: what needs example trajectories cannot be drawn from a download.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from dadiff.errors import StoreError
+from dadiff.store import Cell, Results, Sweep, Sweeps
+from dadiff.store.files import make_folder, read_json
+from dadiff.store.results import RECORD
+from dadiff.tracking.client import open_client, refused
+
+if TYPE_CHECKING:
+    from mlflow import MlflowClient
+    from mlflow.entities import Run
+
+
+def download(uri: str, name: str, folder: Path) -> Sweep:
+    """Write the runs under the parent run `name`, or those of the experiment `name`, as a results folder.
+
+    Raises:
+        StoreError: if there is neither, or the store is away.
+    """
+    if "'" in name:
+        raise StoreError(f"MLflow: {json.dumps(name)} holds a quote; give the name of a sweep or of an experiment")
+    with refused(uri):
+        client = open_client(uri)
+        runs, definition = _find(client, name)
+        cells = [_fetch(client, run, folder) for run in runs]
+    if not cells:
+        raise StoreError(f"MLflow at {uri}: no sweep and no experiment {name!r} with runs; see the names in its UI")
+    sweep = Sweep(name, f"dadiff +sweeps={name}", definition, cells)
+    Sweeps(folder).write(sweep)
+    return sweep
+
+
+def _find(client: MlflowClient, name: str) -> tuple[list[Run], dict[str, str]]:
+    """The runs, oldest first, and what the sweep ranges over."""
+    experiments = [experiment.experiment_id for experiment in client.search_experiments()]
+    parents = client.search_runs(experiments, f"tags.kind = 'sweep' and tags.key = '{name}'")
+    if parents:
+        children = f"tags.mlflow.parentRunId = '{parents[0].info.run_id}' and tags.kind = 'run'"
+        return _all(client, experiments, children), dict(parents[0].data.params)
+    experiment = client.get_experiment_by_name(name)
+    return _all(client, [experiment.experiment_id], "tags.kind = 'run'") if experiment else [], {}
+
+
+def _all(client: MlflowClient, experiments: list[str], condition: str) -> list[Run]:
+    order = ["attributes.start_time ASC"]
+    page = client.search_runs(experiments, condition, order_by=order)
+    found: list[Run] = list(page)
+    while page.token:
+        page = client.search_runs(experiments, condition, order_by=order, page_token=page.token)
+        found.extend(page)
+    return list({run.data.tags["key"]: run for run in found}.values())
+
+
+def _fetch(client: MlflowClient, run: Run, folder: Path) -> Cell:
+    """Download one run; one that failed before it had a record keeps its status."""
+    key, name = run.data.tags["key"], run.info.run_name or run.data.tags["key"]
+    files = [item.path for item in client.list_artifacts(run.info.run_id) if not item.is_dir]
+    if RECORD not in files:
+        return Cell(key, name, status=run.info.status.lower())
+    target = make_folder(Results(folder).folder(key))
+    for path in files:
+        client.download_artifacts(run.info.run_id, path, str(target))
+    record = read_json(target / RECORD)
+    return Cell(key, record["name"], record["axes"], record["status"], record.get("reason"))

@@ -1,0 +1,153 @@
+"""Kill a sweep in every place that matters, run it again, and hold the end against an undisturbed sweep.
+
+    python -m tests.faults.kills        prints the table
+
+Each trial starts from nothing: two workers, one training, four cells. What is held: the rerun completes, its tables
+and weights equal the undisturbed ones bit for bit, no result that was there is made again, MLflow has one finished
+run a cell and a training, and nothing is left RUNNING.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from dadiff.store import Cache, Results
+from dadiff.tracking.client import open_client
+
+SWEEP = [
+    "-m", "projector=none,known", "sampler.num_steps=4,5", "denoiser=mlp", "denoiser.width=16", "denoiser.blocks=1",
+    "training.steps=30", "training.warmup=1", "training.batch_size=8", "training.checkpoint_every=10", "sampler=ddim",
+    "dataset.train_size=60", "dataset.test_size=2", "evaluation.samples=2", "device=cpu", "progress=false",
+    "hydra.launcher.workers=2",
+]  # fmt: skip
+
+PLACES = {
+    "job: at its start": "dadiff.launching.jobs:run:before",
+    "job: before sampling": "dadiff.experiment:draw_plans:before",
+    "job: after sampling": "dadiff.experiment:draw_plans:after",
+    "job: before its result is written": "dadiff.store.results:Results.write:before",
+    "job: tables written, record not": "dadiff.store.results:write_json:before",
+    "job: result written, not in its place": "dadiff.store.results:_replace:before",
+    "job: result in its place": "dadiff.store.results:_replace:after",
+    "job: sent by the system": "dadiff.experiment:evaluate:before",
+    "trainer: before it trains": "dadiff.assembly:train:before",
+    "trainer: before a checkpoint": "dadiff.denoisers.learning:State.store:before",
+    "trainer: after a checkpoint": "dadiff.denoisers.learning:State.store:after",
+    "trainer: at its end": "dadiff.denoisers.learning:_finish:after",
+    "cache: before the manifest": "dadiff.store.cache:write_json:before",
+    "cache: before the rename": "dadiff.store.cache:sync_folder:after",
+    "data set: half written": "dadiff.assembly:save_data:after",
+    "MLflow: run made, nothing done": "dadiff.tracking.tracking:Tracking.start:after",
+    "MLflow: before logging": "dadiff.tracking.tracking:Tracking.log_run:before",
+    "MLflow: metrics logged, files not": "mlflow:MlflowClient.log_artifact:before",
+    "MLflow: everything logged, run open": "mlflow:MlflowClient.set_terminated:before",
+    "MLflow: run closed, not marked": "mlflow:MlflowClient.set_terminated:after",
+    "launcher: after its start": "dadiff.launching.sweep:SweepRun.open:after",
+    "launcher: as a job ends": "dadiff.launching.processes:Watch.ended:before",
+    "launcher: before its end": "dadiff.launching.sweep:SweepRun.close:before",
+    "launcher: in MLflow's table": "dadiff.tracking.tracking:Tracking.close_sweep:before",
+}
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What became of a sweep that was killed once and run again."""
+
+    codes: tuple[int, int]
+    problems: list[str]
+    redone: int
+    seconds: float
+
+
+def launch(root: Path, fault: str = "", arguments: list[str] | None = None) -> subprocess.CompletedProcess[str]:
+    """Run the sweep in `root`, with a trap or without."""
+    environment = {**os.environ, "FAULT": fault, "FAULT_TOKEN": str(root.parent / f"{root.name}.token")}
+    command = [sys.executable, str(Path(__file__).with_name("faulty_dadiff.py")), *SWEEP, *(arguments or [])]
+    return subprocess.run(
+        [*command, f"output_dir={root}"], env=environment, capture_output=True, text=True, check=False, timeout=300
+    )
+
+
+def reference(root: Path) -> dict[str, bytes]:
+    """Every result of an undisturbed sweep."""
+    ended = launch(root)
+    if ended.returncode:
+        raise RuntimeError(ended.stderr)
+    return fingerprints(root)
+
+
+def fingerprints(root: Path) -> dict[str, bytes]:
+    """Key -> the bytes that must not depend on what happened on the way: tables, and weights."""
+    found = {run.key: (run.folder / "per_step.parquet").read_bytes() for run in Results(root) if run.has("per_step")}
+    for entry in Cache(root).entries():
+        if entry.kind == "denoiser" and entry.state == "whole":
+            found[entry.key] = (entry.folder / "model.safetensors").read_bytes()
+    return found
+
+
+def trial(root: Path, fault: str, expected: dict[str, bytes]) -> Trial:
+    """Kill, run again, and compare."""
+    start = time.monotonic()
+    first = launch(root, fault)
+    fell = (root.parent / f"{root.name}.token").exists()
+    before = {
+        run.key: (run.folder / "run.json").stat().st_mtime_ns for run in Results(root) if run.status == "finished"
+    }
+    second = launch(root)
+    problems = [] if fell else ["the trap did not spring"]
+    problems += [] if second.returncode == 0 else [f"the rerun failed: {second.stderr[-500:]}"]
+    problems += [] if fingerprints(root) == expected else ["results differ from those of the undisturbed sweep"]
+    again = [key for key, at in before.items() if (Results(root).folder(key) / "run.json").stat().st_mtime_ns != at]
+    problems += [f"done twice: {key}" for key in again]
+    problems += mlflow_problems(root)
+    redone, seconds = len(expected) - 1 - len(before), time.monotonic() - start
+    return Trial((first.returncode, second.returncode), problems, redone, seconds)
+
+
+def mlflow_problems(root: Path) -> list[str]:
+    """What MLflow shows that it should not, or lacks."""
+    client = open_client(f"sqlite:///{root}/mlflow.db")
+    (experiment,) = (e for e in client.search_experiments() if e.name == "dadiff")
+    runs = client.search_runs([experiment.experiment_id], max_results=1000)
+    problems = [f"left RUNNING: {run.info.run_name}" for run in runs if run.info.status == "RUNNING"]
+    finished = [run for run in runs if run.info.status == "FINISHED"]
+    kinds = sorted(run.data.tags["kind"] for run in finished)
+    if kinds != ["run"] * 4 + ["sweep", "training"]:
+        problems.append(f"MLflow has finished runs {kinds}")
+    for run in finished:
+        if run.data.tags["kind"] == "run":
+            steps = [point.step for point in client.get_metric_history(run.info.run_id, "along_time/gap")]
+            problems += (
+                [] if steps == sorted(set(steps)) and len(steps) == 31 else [f"curve of {run.info.run_name}: {steps}"]
+            )
+    return problems
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--only", default="", help="part of a place's name")
+    wanted = parser.parse_args().only
+    folder = Path(tempfile.mkdtemp())
+    expected = reference(folder / "undisturbed")
+    sys.stdout.write(f"{'killed':<38} {'exit':>5} {'rerun':>5} {'redone':>6} {'s':>4}  verdict\n")
+    for number, (place, fault) in enumerate(PLACES.items()):
+        if wanted in place:
+            done = trial(folder / str(number), fault, expected)
+            verdict = "; ".join(done.problems) or "equal, once, closed"
+            row = f"{place:<38} {done.codes[0]:>5} {done.codes[1]:>5} {done.redone:>6} {done.seconds:>4.0f}  {verdict}"
+            sys.stdout.write(row + "\n")
+            sys.stdout.flush()
+    shutil.rmtree(folder)
+
+
+if __name__ == "__main__":
+    main()
