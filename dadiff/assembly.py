@@ -46,7 +46,13 @@ class Experiment:
     @cached_property
     def target(self) -> LinearSystem:
         """The system, or the robots, that plans are made for."""
-        return self.parts["task"].target(self.parts["system"])
+        target = self.parts["task"].target(self.parts["system"])
+        if not isinstance(target, LinearSystem):
+            raise ConfigError(
+                "task: it plans for one system, and the chosen system is a family of robots; "
+                "use task=fleet, or a single system such as system=double_integrator"
+            )
+        return target
 
     @cached_property
     def layout(self) -> Layout:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import torch
 import yaml
 
@@ -25,8 +26,11 @@ from dadiff.projectors import AdmissibleSet, Known, Projection
 from dadiff.provenance import provenance
 from dadiff.randomness import numpy_generator, torch_generator
 from dadiff.store import StoredRun
-from dadiff.tasks import Scores
+from dadiff.systems import LinearSystem, Robots
+from dadiff.tasks import Fleet, Scores
 from dadiff.trajectory.subspace import largest_angle, projector_distance
+
+EXAMPLE_ROBOTS = 3
 
 
 @dataclass
@@ -165,8 +169,12 @@ def _store(experiment: Experiment, config: Mapping[str, Any], plans: Plans, star
     arrays = {}
     if diverged_at is None:
         scores = evaluate(experiment, plans.planned)
-        record["metrics"] = {**headline(scores), **plans.measures}
+        metrics = {**headline(scores), **plans.measures}
         written |= tables(scores)
+        if isinstance(task := experiment.parts["task"], Fleet):
+            metrics |= task.headline(scores)
+            written["robots"] = pd.DataFrame(task.robot_table(experiment.parts["system"]))
+        record["metrics"] = metrics
         arrays = examples(experiment, plans)
     text = yaml.safe_dump(dict(config), sort_keys=False)
     return experiment.results.write(record, config_text=text, tables=written, arrays=arrays)
@@ -183,11 +191,18 @@ def evaluate(experiment: Experiment, planned: np.ndarray) -> Scores:
 
 
 def examples(experiment: Experiment, plans: Plans) -> dict[str, np.ndarray]:
-    """The first cases' plans, for figures, and one plan along the chain beside its noised reference."""
-    layout, cases = experiment.layout, experiment.data[1]
-    first = (..., slice(experiment.parts["evaluation"].examples), slice(None))
-    planned = plans.planned[..., : experiment.parts["evaluation"].examples, :, :]
-    reference, environment, x_init = cases.reference[first], cases.environment[first], cases.x_init[first]
+    """The first cases' plans, for figures, and one plan along the chain beside its noised reference.
+
+    states and rollout_states (cases, samples, T+1, n), inputs (cases, samples, T, m), reference_states (cases, T+1, n),
+    reference_inputs (cases, T, m), environment (cases, c). Of a fleet all these have a first dimension of a few robots
+    that differ most, `robots` (k,) says which ones, and their first case is the same.
+    """
+    layout, cases, count = experiment.layout, experiment.data[1], experiment.parts["evaluation"].examples
+    system, shown = _shown(experiment.target)
+    planned = plans.planned[shown][..., :count, :, :]
+    reference, environment, x_init = (
+        values[shown][..., :count, :] for values in (cases.reference, cases.environment, cases.x_init)
+    )
     steps, chain = plans.snapshots.stacked()
     states, inputs = layout.split(planned)
     reference_states, reference_inputs = layout.split(reference)
@@ -195,14 +210,23 @@ def examples(experiment: Experiment, plans: Plans) -> dict[str, np.ndarray]:
     return {
         "states": states,
         "inputs": inputs,
-        "rollout_states": layout.states(replay(experiment.target, layout, planned, x_init)),
+        "rollout_states": layout.states(replay(system, layout, planned, x_init)),
         "reference_states": reference_states,
         "reference_inputs": reference_inputs,
         "environment": environment,
         "chain_steps": steps,
         "chain_states": layout.states(experiment.coordinates.to_physical(chain)),
         "noised_states": layout.states(noised),
+        **({} if shown is Ellipsis else {"robots": shown}),
     }
+
+
+def _shown(target: LinearSystem) -> tuple[LinearSystem, Any]:
+    """The robots whose plans are stored, as a system and as an index; everything where there is one system."""
+    if not isinstance(target, Robots):
+        return target, Ellipsis
+    shown = target.most_different(EXAMPLE_ROBOTS)
+    return target.take(shown), shown
 
 
 def _noised(experiment: Experiment, reference: np.ndarray, steps: np.ndarray) -> np.ndarray:

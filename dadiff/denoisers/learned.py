@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from dadiff.denoisers.description import describe
+from dadiff.denoisers.networks import RecordingNetwork
 from dadiff.denoisers.prediction import prediction
 from dadiff.denoisers.recipes import Recipe
 from dadiff.diffusion.schedule import Schedule
@@ -59,8 +60,10 @@ class NetworkDenoiser(nn.Module):
 
     def standardise_by(self, environment: np.ndarray) -> None:
         """Scale E by the mean and deviation of a training set's (N, c); what never varies keeps its unit."""
-        deviation = environment.std(axis=0)
-        self.environment_mean.copy_(torch.from_numpy(environment.mean(axis=0)))
+        mean, deviation = environment.mean(axis=0), environment.std(axis=0)
+        if isinstance(self.network, RecordingNetwork):
+            mean, deviation = self.network.tied(mean), self.network.tied(deviation)
+        self.environment_mean.copy_(torch.from_numpy(mean))
         self.environment_scale.copy_(torch.from_numpy(np.where(deviation > 0, deviation, 1.0)))
 
     def output(self, tau: Tensor, step: Tensor, environment: Tensor) -> Tensor:

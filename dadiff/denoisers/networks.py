@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -15,6 +16,8 @@ from torch.nn import functional
 from dadiff.trajectory import Layout
 
 STEP_FEATURES = 64
+EMBEDDING = 128
+"""Hidden units in the embedding of one transition of a recording."""
 
 
 def step_features(step: Tensor) -> Tensor:
@@ -65,6 +68,30 @@ class ResidualNetwork(nn.Module):
     def forward(self, tau: Tensor, step: Tensor, environment: Tensor) -> Tensor:
         hidden = self.trajectory(tau) + self.step(step_features(step)) + self.environment(environment)
         return self.output(self.blocks(hidden))
+
+
+class RecordingNetwork(nn.Module):
+    """`ResidualNetwork` that is told of a recording by the mean of its transitions' embeddings (deep sets).
+
+    E = [x_init; x_target; (x(t), u(t), x(t+1) - x(t)) for each t].
+    """
+
+    def __init__(self, layout: Layout, width: int, blocks: int, context: int) -> None:
+        super().__init__()
+        self.ends, self.transition = 2 * layout.state_dim, 2 * layout.state_dim + layout.input_dim
+        self.embed = nn.Sequential(nn.Linear(self.transition, EMBEDDING), nn.SiLU(), nn.Linear(EMBEDDING, EMBEDDING))
+        self.summarise = nn.Sequential(nn.SiLU(), nn.Linear(EMBEDDING, context))
+        self.plan = ResidualNetwork(layout.size, self.ends + context, width, blocks)
+
+    def forward(self, tau: Tensor, step: Tensor, environment: Tensor) -> Tensor:
+        transitions = environment[:, self.ends :].unflatten(-1, (-1, self.transition))
+        context = self.summarise(self.embed(transitions).mean(dim=-2))
+        return self.plan(tau, step, torch.cat([environment[:, : self.ends], context], dim=-1))
+
+    def tied(self, scale: np.ndarray) -> np.ndarray:
+        """Numbers an entry of E (c,), made the same for all transitions, which one map embeds: their mean over t."""
+        transitions = scale[self.ends :].reshape(-1, self.transition)
+        return np.concatenate([scale[: self.ends], np.tile(transitions.mean(axis=0), len(transitions))])
 
 
 def convolution(channels_in: int, channels_out: int, kernel: int) -> nn.Conv2d:

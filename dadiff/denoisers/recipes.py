@@ -108,6 +108,45 @@ class MLP:
 
 
 @dataclass(frozen=True)
+class RecordingMLP:
+    """`MLP` for E = [x_init; x_target; transitions of a short recording]: learns to identify the robot.
+
+    Args:
+        width: hidden units.
+        blocks: residual blocks of two layers each.
+        context: numbers that the recording is summarised by.
+        prediction: what the network predicts.
+    """
+
+    trainable: ClassVar[bool] = True
+
+    width: int = 512
+    blocks: int = 3
+    context: int = 64
+    prediction: PredictionChoice = "clean"
+
+    def __post_init__(self) -> None:
+        _check_positive("mlp_recording", width=self.width, blocks=self.blocks, context=self.context)
+
+    def build(
+        self, layout: Layout, environment_dim: int, schedule: Schedule, generator: torch.Generator
+    ) -> NetworkDenoiser:
+        """See `Recipe.build`."""
+        from dadiff.denoisers.learned import NetworkDenoiser, on_meta
+        from dadiff.denoisers.networks import RecordingNetwork
+
+        told = environment_dim - 2 * layout.state_dim
+        if told < 1 or told % (2 * layout.state_dim + layout.input_dim):
+            raise ConfigError(
+                f"denoiser mlp_recording: E has {environment_dim} entries and holds no recording; "
+                "use task=fleet task.condition_on=recording, or denoiser=mlp"
+            )
+        with on_meta():
+            network = RecordingNetwork(layout, self.width, self.blocks, self.context)
+        return NetworkDenoiser(network, self, layout, environment_dim, schedule, generator)
+
+
+@dataclass(frozen=True)
 class Gaussian:
     """The exact posterior mean where the law of demonstrations is Gaussian given E. Nothing is trained."""
 

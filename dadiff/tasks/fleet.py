@@ -1,0 +1,159 @@
+"""The fleet: demonstrations of many robots, and plans for robots that are not among them.
+
+The network sees trajectories of all training robots and is told (x_init, x_target), not the robot; what it draws
+becomes a plan of one robot through that robot's projector. Cost, environments and expert are those of the LQR task,
+each robot solved by its own optimum. Every test robot is given the same cases.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+
+from dadiff.errors import ConfigError
+from dadiff.randomness import numpy_generator
+from dadiff.systems import Family, GaussianExcitation, Recording, Robots
+from dadiff.tasks.lqr import LQR
+from dadiff.tasks.task import Cases, Demonstrations, Scores
+from dadiff.trajectory.response import along
+
+SERVED = 1.05
+"""A robot counts as served if its mean cost is within this factor of the optimum."""
+
+
+@dataclass(frozen=True)
+class Fleet:
+    """E = [x_init; x_target], followed by what the network is told of the robot.
+
+    Args:
+        horizon, state_cost, input_cost, init_range, target_range: as for `LQR`, the same for all robots.
+        robots: number of robots in the training set.
+        interpolation: number of test robots inside the family's ranges.
+        extrapolation: number of test robots outside of them.
+        extrapolation_factor: by which the ranges are stretched to draw those.
+        condition_on: `nothing` of the robot; the `robot_parameters` that it was drawn with; or a short `recording`
+            of it from rest, as transitions (x(t), u(t), x(t+1) - x(t)).
+        recording_length: number of these transitions.
+        alone: k restricts training and test to test robot k: what its own demonstrations would give.
+        seed: of the test robots.
+    """
+
+    horizon: int = 30
+    state_cost: Sequence[float] = (10.0, 10.0, 1.0, 1.0)
+    input_cost: float = 1.0
+    init_range: float = 1.0
+    target_range: float = 4.0
+    robots: int = 200
+    interpolation: int = 20
+    extrapolation: int = 20
+    extrapolation_factor: float = 1.5
+    condition_on: Literal["nothing", "robot_parameters", "recording"] = "nothing"
+    recording_length: int = 30
+    alone: int | None = None
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        tested = self.interpolation + self.extrapolation
+        if self.robots < 1 or min(self.interpolation, self.extrapolation) < 0 or tested < 1:
+            raise ConfigError(
+                f"task: robots is {self.robots}, interpolation {self.interpolation}, extrapolation "
+                f"{self.extrapolation}; need at least one robot to train on and one to test"
+            )
+        if not self.extrapolation_factor > 1:
+            raise ConfigError(f"task: extrapolation_factor is {self.extrapolation_factor}; it must exceed 1")
+        if self.recording_length < 1:
+            raise ConfigError(f"task: recording_length is {self.recording_length}; it must be at least 1")
+        if self.alone is not None and not 0 <= self.alone < tested:
+            raise ConfigError(f"task: alone is {self.alone}; the test robots are 0 to {tested - 1}")
+        _ = self.lqr
+
+    @cached_property
+    def lqr(self) -> LQR:
+        """The task of each robot."""
+        return LQR(self.horizon, self.state_cost, self.input_cost, self.init_range, self.target_range)
+
+    def target(self, system: Family) -> Robots:
+        """The test robots: those inside the ranges, then those outside.
+
+        Raises:
+            ConfigError: if the system is no family.
+        """
+        if not isinstance(system, Family):
+            raise ConfigError("task: fleet draws robots from a family; choose one, such as system=damped_integrators")
+        inside = system.ranges.inside(self.interpolation, numpy_generator(self.seed, "robots inside"))
+        rng = numpy_generator(self.seed, "robots outside")
+        outside = system.ranges.outside(self.extrapolation, self.extrapolation_factor, rng)
+        robots = system.robots(np.concatenate([inside, outside]))
+        return robots if self.alone is None else robots.take([self.alone])
+
+    def environment_dim(self, system: Robots) -> int:
+        """c."""
+        n, m = system.state_dim, system.input_dim
+        recorded = self.recording_length * (2 * n + m)
+        told = {"nothing": 0, "robot_parameters": len(system.parameters), "recording": recorded}
+        return 2 * n + told[self.condition_on]
+
+    def demonstrations(self, system: Family, count: int, rng: np.random.Generator) -> Demonstrations:
+        """`count` noisy runs of its expert for each training robot, each in an environment of its own."""
+        robots = system.inside(self.robots, rng) if self.alone is None else self.target(system)
+        environment = self.lqr.sample_environments(robots, (*robots.robots, count), rng)
+        trajectories = self.lqr.realise(robots, environment, rng)
+        condition = self._condition(environment, robots, count, rng)
+        notes = {"robots": float(len(robots.A)), "demonstrations a robot": float(count)}
+        return Demonstrations(_joined(trajectories), _joined(condition), notes)
+
+    def cases(self, system: Robots, count: int, rng: np.random.Generator) -> Cases:
+        """`count` cases, the same for every robot, each with the robot's own optimum and one recording a robot."""
+        environment = self.lqr.sample_environments(system, (count,), rng)
+        environment = np.broadcast_to(environment, (*system.robots, *environment.shape))
+        reference = along(self.lqr.law(system).mean_map, environment)
+        condition = self._condition(environment, system, 1, rng)
+        return Cases(condition, environment[..., : system.state_dim], reference)
+
+    def score(self, system: Robots, cases: Cases, planned: np.ndarray, rollout: np.ndarray) -> Scores:
+        """The cost after replay, relative to each robot's own optimum."""
+        ends = replace(cases, environment=cases.environment[..., : 2 * system.state_dim])
+        return self.lqr.score(system, ends, planned, rollout)
+
+    def robot_table(self, system: Family) -> dict[str, np.ndarray]:
+        """Per test robot: its group, its distance from the training ranges (in their widths), its parameters."""
+        robots = self.target(system)
+        distance = system.ranges.distance(robots.parameter_table)
+        return {
+            "robot": np.arange(len(distance)),
+            "group": np.where(distance > 0, "extrapolation", "interpolation"),
+            "distance": distance,
+            **robots.parameters,
+        }
+
+    def headline(self, scores: Scores) -> dict[str, float]:
+        """Of the robots' mean cost ratios: their median, and the share within 5 % of the optimum."""
+        ratio = scores.per_plan["cost_ratio"].mean(axis=(-2, -1))
+        return {"median_cost_ratio": float(np.median(ratio)), "robots_served": float((ratio <= SERVED).mean())}
+
+    def _condition(self, environment: np.ndarray, robots: Robots, count: int, rng: np.random.Generator) -> np.ndarray:
+        """E with what is told of the robot; `count` recordings a robot, one for each environment or one for all."""
+        if self.condition_on == "nothing":
+            return environment
+        if self.condition_on == "robot_parameters":
+            told = robots.parameter_table[..., None, :]
+        else:
+            excitation = GaussianExcitation(self.recording_length, count=count, seed=int(rng.integers(2**31)))
+            told = transitions(excitation.record(robots))
+        return np.concatenate([environment, np.broadcast_to(told, (*environment.shape[:-1], told.shape[-1]))], axis=-1)
+
+
+def transitions(recording: Recording) -> np.ndarray:
+    """(x(t), u(t), x(t+1) - x(t)) for t = 0..S-1, flat: (*robots, count, S (2n + m))."""
+    x, u = recording.states, recording.inputs
+    steps = np.concatenate([x[..., :-1, :], u, np.diff(x, axis=-2)], axis=-1)
+    return steps.reshape(*steps.shape[:-2], -1)
+
+
+def _joined(array: np.ndarray) -> np.ndarray:
+    """(robots, count, ...) to (robots * count, ...)."""
+    return array.reshape(-1, *array.shape[2:])
