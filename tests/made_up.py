@@ -72,7 +72,7 @@ class MadeUp:
 
     def _record(self, key, name, status, axes, metrics, notes, reason, step, robots) -> dict[str, Any]:
         counts = {"cases": self.sizes[0], "samples": self.sizes[1]}
-        links = {"dataset": f"data{axes['seed']}", "denoiser": f"net{axes['seed']}"}
+        links = {"cases": f"data{axes['seed']}", "denoiser": f"net{axes['seed']}"}
         if axes.get("denoiser") == "gaussian":
             del links["denoiser"]
         if "recording.length" in axes:
@@ -99,8 +99,8 @@ class Draw:
         self.horizon, self.robots = horizon, robots
         scale = np.ones(1) if robots is None else robots
         difficulty = np.exp(0.5 * np.random.default_rng(seed).standard_normal(sizes[0]))
-        noise = np.exp(spread * np.random.default_rng(int(key[:8], 16)).standard_normal((len(scale), *sizes)))
-        self.factor = scale[:, None, None] * difficulty[:, None] * noise
+        noise = np.random.default_rng(int(key[:8], 16)).standard_normal((len(scale), *sizes, horizon + 1))
+        self.factor = (scale[:, None, None] * difficulty[:, None])[..., None] * np.exp(spread * noise)
 
     def _table(self, columns: dict[str, np.ndarray], names: tuple[str, ...]) -> pd.DataFrame:
         shape = next(iter(columns.values())).shape
@@ -112,15 +112,15 @@ class Draw:
     def per_step(self, levels: dict[str, float], shape: np.ndarray | None) -> pd.DataFrame:
         """The table along time; inputs and residuals are nan at T."""
         curve = np.linspace(0.5, 1.5, self.horizon + 1) if shape is None else shape
-        columns = {name: level * self.factor[..., None] * curve for name, level in levels.items()}
+        columns = {name: level * self.factor * curve for name, level in levels.items()}
         for name in ("planned_input_error", "dynamics_residual"):
             columns[name][..., -1] = np.nan
         return self._table(columns, ("robot", "case", "sample", "t"))
 
     def per_plan(self, levels: dict[str, float]) -> pd.DataFrame:
         """The table with one row a plan."""
-        columns = {name: level * self.factor for name, level in levels.items()}
-        columns["cost_ratio"] = 1 + (levels["cost_ratio"] - 1) * self.factor
+        columns = {name: level * self.factor[..., 0] for name, level in levels.items()}
+        columns["cost_ratio"] = 1 + (levels["cost_ratio"] - 1) * self.factor[..., 0]
         return self._table(columns, ("robot", "case", "sample"))
 
 

@@ -124,7 +124,7 @@ def pair(method: Method, other: Method) -> tuple[list[Cell], list[Cell]]:
     """
     pairs = [(a, b) for a in method.finished for b in other.finished if _same_draw(a, b)]
     for a, b in pairs:
-        if a.record["links"].get("dataset") != b.record["links"].get("dataset"):
+        if a.record["links"].get("cases") != b.record["links"].get("cases"):
             raise StoreError(f"runs {a.key} and {b.key}: their data sets differ, so their cases cannot be paired")
     return [a for a, _ in pairs], [b for _, b in pairs]
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import logging
 import sys
+import tempfile
 from pathlib import Path
 
 from dadiff.errors import DadiffError
@@ -36,18 +37,30 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def write(options: argparse.Namespace) -> Path:
+    """Write the report of what lies in the results folder, or of what MLflow holds."""
+    if options.tracking_uri is None:
+        return _write(options, options.output_dir)
+    from dadiff.tracking.download import download
+
+    with tempfile.TemporaryDirectory() as folder:
+        for name in options.sweep:
+            download(options.tracking_uri, name, Path(folder))
+        return _write(options, Path(folder))
+
+
+def _write(options: argparse.Namespace, source: Path) -> Path:
     """Read, gather and render; imports are late so that help answers at once."""
     from dadiff.reporting.aggregation import Evidence
     from dadiff.reporting.claims import read_ledger
-    from dadiff.reporting.definitions import folder, for_sweep, load
+    from dadiff.reporting.definitions import FOLDER, for_sweep, load
     from dadiff.reporting.render import render
     from dadiff.reporting.report import build
     from dadiff.reporting.sources import read_sweeps
 
-    sweep = read_sweeps(options.output_dir, options.sweep)
-    definition = load(options.definition) if options.definition else for_sweep(options.sweep[0])
+    sweep = read_sweeps(source, options.sweep)
+    definition = load(options.definition) if options.definition else for_sweep(sweep.name)
     command = f"dadiff-report {' '.join(options.sweep)} --definition {definition.name}"
-    report = build(definition, Evidence(sweep), read_ledger(folder() / "claims.yaml"), command)
+    report = build(definition, Evidence(sweep), read_ledger(FOLDER / "claims.yaml"), command)
     return render(report, options.out or options.output_dir / "reports" / sweep.name)
 
 

@@ -15,13 +15,16 @@ import inspect
 import pkgutil
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import yaml
 
 from dadiff.errors import ConfigError
+from dadiff.folders import shipped
 from dadiff.reporting import figures, tables
+
+FOLDER = shipped("reports")
+"""Holds the definitions, the ledger and the templates."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +57,7 @@ def _figure(kind: str, item: str) -> Callable[..., Any]:
     if kind not in kinds:
         raise ConfigError(f"report item {item}: unknown kind {kind!r}; expected {', '.join(kinds)}")
     module = importlib.import_module(f"{figures.__name__}.{kind}")
-    return module.collect  # type: ignore[no-any-return]
+    return module.collect
 
 
 @dataclass(frozen=True)
@@ -70,33 +73,26 @@ class Definition:
     tables: list[Item] = field(default_factory=list)
 
 
-def folder() -> Path:
-    """Where definitions, ledger and templates lie: in the installed package, or beside it in a checkout."""
-    package = Path(__file__).parents[1]
-    inside = package / "shipped" / "reports"
-    return inside if inside.is_dir() else package.parent / "reports"
-
-
 def load(name: str) -> Definition:
     """The definition of a name.
 
     Raises:
         ConfigError: if there is none, or it has unknown or missing keys.
     """
-    path = folder() / f"{name}.yaml"
+    path = FOLDER / f"{name}.yaml"
     if not path.is_file():
-        raise ConfigError(f"no report definition {name!r}; found {', '.join(names())} in {folder()}")
+        raise ConfigError(f"no report definition {name!r}; found {', '.join(names())} in {FOLDER}")
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
-        parts = {kind: [Item(**item) for item in content.pop(kind, [])] for kind in ("figures", "tables")}
-        return Definition(name=name, **parts, **content)
+        parts = [[Item(**item) for item in content.pop(kind, [])] for kind in ("figures", "tables")]
+        return Definition(name=name, figures=parts[0], tables=parts[1], **content)
     except (TypeError, AttributeError, yaml.YAMLError) as error:
         raise ConfigError(f"{path}: {error}; expected the keys of a report definition") from None
 
 
 def names() -> list[str]:
     """All definitions."""
-    return sorted(path.stem for path in folder().glob("*.yaml") if path.stem != "claims")
+    return sorted(path.stem for path in FOLDER.glob("*.yaml") if path.stem != "claims")
 
 
 def for_sweep(sweep: str) -> Definition:

@@ -19,10 +19,24 @@ ENFORCEMENTS = {
     "post_hoc": "once at the end",
     "normalised": "every step",
     "convex": "convex",
-    "clean_estimate": "clean estimate",
+    "clean_estimate": "on the clean estimate",
     "literal": "as printed",
 }
-SYMBOLS = {"recording.length": "S", "recording.process_noise": "σ_Γ", "system.process_noise": "σ_w"}
+WORDS: dict[str, dict[str, str]] = {
+    "projector": PROJECTORS,
+    "enforcement": ENFORCEMENTS,
+    "initial_state": {"fixed": "x(0) fixed", "free": "x(0) free"},
+    "sampler.last_step_noise": {"True": "with last-step noise", "False": "without last-step noise"},
+    "denoiser": {"gaussian": "exact denoiser"},
+}
+CHOICES = (*WORDS, "task", "sampler", "schedule", "training", "system")
+SYMBOLS = {
+    "recording.length": "S",
+    "training.steps": "gradient steps",
+    "sampler.num_steps": "steps",
+    "recording.process_noise": "σ_Γ",
+    "system.process_noise": "σ_w",
+}
 METRICS = {
     "planned_state_error": "state error ‖x(t) − x*(t)‖²",
     "planned_input_error": "control error ‖u(t) − u*(t)‖²",
@@ -72,14 +86,8 @@ def method_name(axes: Mapping[str, Any], shown: Iterable[str] = ()) -> str:
 
 def axis_value(axis: str, value: Any) -> str:
     """One condition in words, for example `S = 100` or `every step`."""
-    if axis == "projector":
-        return PROJECTORS.get(str(value), str(value))
-    if axis == "enforcement":
-        return ENFORCEMENTS.get(str(value), str(value))
-    if axis == "initial_state":
-        return {"fixed": "x(0) fixed", "free": "x(0) free"}.get(str(value), str(value))
-    if axis in ("task", "sampler", "denoiser"):
-        return str(value)
+    if axis in CHOICES:
+        return WORDS.get(axis, {}).get(str(value), str(value))
     return f"{axis_name(axis)} = {format(value, 'g') if isinstance(value, float) else value}"
 
 
@@ -94,13 +102,17 @@ def number(value: float | None, digits: int = 3) -> str:
         return "–"
     if math.isinf(value):
         return "∞" if value > 0 else "−∞"
-    if value == 0 or 1e-3 <= abs(value) < 1e4:
-        decimals = 0 if value == 0 else max(digits - 1 - math.floor(math.log10(abs(value))), 0)
+    if value == round(value) and abs(value) < 1e4:
+        return f"{value:.0f}".replace("-", "−")
+    if 1e-3 <= abs(value) < 1e4:
+        decimals = max(digits - 1 - math.floor(math.log10(abs(value))), 0)
         return f"{value:.{decimals}f}".replace("-", "−")
     mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
     return f"{mantissa}·10{str(int(exponent)).translate(SUPERSCRIPT)}".replace("-", "−")
 
 
 def with_interval(value: float, low: float, high: float) -> str:
-    """A value and its 95 % interval."""
+    """A value and its 95 % interval, if it has any width."""
+    if low == high:
+        return number(value)
     return f"{number(value)} [{number(low)}, {number(high)}]"

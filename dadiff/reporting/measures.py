@@ -12,9 +12,18 @@ from typing import Any
 import numpy as np
 
 from dadiff.reporting.aggregation import Evidence, Method, case_means, case_scalars, has_metric, pair, weights_for
-from dadiff.reporting.labels import axis_value, method_name, metric_name, number, with_interval
+from dadiff.reporting.labels import axis_value, method_name, metric_name, with_interval
 from dadiff.reporting.selection import Selector
-from dadiff.reporting.statistics import Estimate, interval, mean, plain_mean, ratio, resampled_means, simultaneous_band
+from dadiff.reporting.statistics import (
+    Band,
+    Estimate,
+    interval,
+    mean,
+    plain_mean,
+    ratio,
+    resampled_means,
+    simultaneous_band,
+)
 
 
 @dataclass(frozen=True)
@@ -95,15 +104,18 @@ def worst_difference(
         values = case_means(own, metric) - case_means(theirs, metric)
         values = values[..., ~np.isnan(values).all(axis=tuple(range(values.ndim - 1)))]
         band = simultaneous_band(values, weights_for(values.shape[:-1]))
-        worst = int(band.high.argmax())
-        estimate = Estimate(float(band.value[worst]), float(band.low.max()), float(band.high.max()))
-        text = (
-            f"{metric_name(metric)} below {_name_of(other, against)} at {int((band.high < 0).sum())} of "
-            f"{len(band.value)} times (the band covers all times at once), least at t = {worst}: difference "
-            f"{_words(Estimate(estimate.value, float(band.low[worst]), float(band.high[worst])))}"
-        )
+        estimate = Estimate(float(band.value.max()), float(band.low.max()), float(band.high.max()))
+        text = f"{metric_name(metric)} {_along(band)}, against {_name_of(other, against)}"
         out.append(Measured(method_name(method.axes, shown), method.axes, estimate, text, method.keys + other.keys))
     return out
+
+
+def _along(band: Band) -> str:
+    """Where a band of differences is below and above 0, and the time with the highest upper bound."""
+    below, above, count = int((band.high < 0).sum()), int((band.low > 0).sum()), len(band.value)
+    worst = int(band.high.argmax())
+    at = _words(Estimate(float(band.value[worst]), float(band.low[worst]), float(band.high[worst])))
+    return f"lower at {below} and higher at {above} of {count} times at once, difference at t = {worst}: {at}"
 
 
 def dip(
@@ -205,8 +217,6 @@ def _name_of(other: Method, against: Selector) -> str:
 
 
 def _words(estimate: Estimate) -> str:
-    if estimate.low == estimate.high:
-        return number(estimate.value)
     return with_interval(estimate.value, estimate.low, estimate.high)
 
 

@@ -17,7 +17,7 @@ from markupsafe import Markup
 
 from dadiff.errors import StoreError
 from dadiff.reporting import labels
-from dadiff.reporting.definitions import folder as definitions_folder
+from dadiff.reporting.definitions import FOLDER
 from dadiff.reporting.figures.style import INK, Drawable
 from dadiff.reporting.figures.style import render as render_figure
 from dadiff.reporting.latex import to_latex
@@ -77,7 +77,7 @@ def numbers(report: Report) -> dict[str, Any]:
         "tables": {part.item.id: _part(part) for part in report.tables},
         "figures": {part.item.id: _part(part) for part in report.figures},
     }
-    return strict(content)  # type: ignore[no-any-return]
+    return strict(content)
 
 
 def _part(part: Part) -> dict[str, Any]:
@@ -98,7 +98,7 @@ def _plain(value: Any) -> Any:
 def to_html(report: Report) -> str:
     """The page: one file that asks for nothing else. Whatever comes from a store is escaped."""
     environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(definitions_folder() / "templates"),
+        loader=jinja2.FileSystemLoader(FOLDER / "templates"),
         autoescape=True,
         trim_blocks=True,
         lstrip_blocks=True,

@@ -16,11 +16,20 @@ import pandas as pd
 
 from dadiff.errors import StoreError
 from dadiff.store import Results, StoredRun, Sweeps
+from dadiff.store.files import read_json
+from dadiff.tracking.markers import MARKER
+
+LOCAL_UI = "http://127.0.0.1:5000"
+"""Where `mlflow ui` answers."""
 
 
 @lru_cache(maxsize=64)
 def _table(folder: Path, name: str) -> pd.DataFrame:
     return StoredRun(folder, {"status": "finished"}).table(name)
+
+
+def _server(uri: str) -> str:
+    return uri.rstrip("/") if uri.startswith(("http://", "https://")) else LOCAL_UI
 
 
 @dataclass(frozen=True)
@@ -58,6 +67,15 @@ class Cell:
         if self.status == "diverged" and self.record.get("diverged_step") is not None:
             return f"diverged at step {self.record['diverged_step']}"
         return f"{self.status}: {reason}" if reason else self.status
+
+    @property
+    def mlflow(self) -> list[str]:
+        """Pages of the run in MLflow; of a store that is a file, in the UI that is opened on it."""
+        path = self.run.folder / MARKER if self.run else None
+        if path is None or not path.is_file():
+            return []
+        stores = read_json(path)["stores"].items()
+        return [f"{_server(uri)}/#/experiments/{m['experiment_id']}/runs/{m['run_id']}" for uri, m in stores]
 
     @property
     def metrics(self) -> dict[str, float]:

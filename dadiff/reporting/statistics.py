@@ -83,8 +83,11 @@ def plain_mean(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 
 def interval(resampled: np.ndarray) -> tuple[float, float]:
-    """Percentile interval of (resamples,); nan if a resample is."""
+    """Percentile interval of (resamples,), leaving out resamples that drew nothing defined; nan if all did."""
     tail = (1 - CONFIDENCE) / 2
+    resampled = resampled[~np.isnan(resampled)]
+    if not resampled.size:
+        return float("nan"), float("nan")
     low, high = np.quantile(resampled, [tail, 1 - tail])
     return float(low), float(high)
 
@@ -101,7 +104,8 @@ def interquartile_mean(values: np.ndarray, weights: np.ndarray) -> Estimate:
     ordered, weights = values.ravel()[defined], weights.reshape(len(weights), -1)[:, defined]
     order = np.argsort(ordered, kind="stable")
     equal = np.full((1, ordered.size), 1 / ordered.size)
-    weights = weights[:, order] / weights.sum(axis=1, keepdims=True)
+    with np.errstate(invalid="ignore"):
+        weights = weights[:, order] / weights.sum(axis=1, keepdims=True)
     return Estimate(float(_middle_half(ordered[order], equal)[0]), *interval(_middle_half(ordered[order], weights)))
 
 

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from dadiff.reporting.aggregation import Evidence, Method, case_means, varying, weights_for
 from dadiff.reporting.figures.style import legend_below, letter, log_axis, look_of, panels
-from dadiff.reporting.labels import method_name, metric_name
+from dadiff.reporting.labels import axis_value, method_name, metric_name
 from dadiff.reporting.selection import Selector
 from dadiff.reporting.statistics import Band, simultaneous_band
 
@@ -27,9 +27,10 @@ class Curve:
 
 @dataclass(frozen=True)
 class Panel:
-    """One metric."""
+    """One metric under one condition."""
 
     metric: str
+    condition: str
     curves: list[Curve]
 
 
@@ -62,19 +63,33 @@ def _draw_panel(ax: Axes, panel: Panel, marked: list[int]) -> None:
     for t_marked in marked:
         ax.axvline(t_marked, color="#888888", lw=0.8, ls=":", zorder=0)
     log_axis(ax, "y")
-    ax.set_title(metric_name(panel.metric))
+    ax.set_title("\n".join(filter(None, (metric_name(panel.metric), panel.condition))))
     ax.set_xlabel("time t")
 
 
 def collect(
-    evidence: Evidence, *, metrics: list[str], cells: Selector, marked: list[int] | None = None
+    evidence: Evidence, *, metrics: list[str], cells: Selector, by: str | None = None, marked: list[int] | None = None
 ) -> ErrorsOverTime:
-    """Mean over cases and plans of each metric at each t, for the methods that `cells` asks for."""
+    """Mean over cases and plans of each metric at each t, for the methods that `cells` asks for.
+
+    Args:
+        by: an axis with panels of its own for each value.
+        marked: times to mark.
+    """
     methods = evidence.methods(cells)
     alive, shown = [method for method in methods if method.finished], varying(methods)
-    curves = [Panel(metric, [_curve(method, metric, shown) for method in alive]) for metric in metrics]
+    values = list(dict.fromkeys(method.axes.get(by) for method in alive)) if by else [None]
+
+    def panel(metric: str, value: Any) -> Panel:
+        here = [method for method in alive if by is None or method.axes.get(by) == value]
+        condition = axis_value(by, value) if by and len(values) > 1 else ""
+        return Panel(
+            metric, condition, [_curve(method, metric, [name for name in shown if name != by]) for method in here]
+        )
+
+    panels = [panel(metric, value) for value in values for metric in metrics]
     notes = [f"{method_name(method.axes, shown)}: {method.outcome}" for method in methods if method.lost]
-    return ErrorsOverTime(curves if alive else [], marked or [], [key for m in alive for key in m.keys], notes)
+    return ErrorsOverTime(panels if alive else [], marked or [], [key for m in alive for key in m.keys], notes)
 
 
 def _curve(method: Method, metric: str, shown: list[str]) -> Curve:

@@ -45,7 +45,7 @@ class Matrix:
         """Dark is a large error; every cell states its mean and its interval."""
         figure, (ax,) = panels(1, columns, width=1.8 + 1.02 * len(self.columns), height=1.1 + 0.5 * len(self.rows))
         values = [e.estimate.value for e in self.entries if e.estimate and e.estimate.value > 0]
-        norm = LogNorm(min(values, default=1), max(values, default=1) * 1.0001)
+        norm = LogNorm(min(values, default=1), max(values, default=1) * 1.0001, clip=True)
         for entry in self.entries:
             self._draw_entry(ax, entry, norm)
         ax.set_xlim(-0.5, len(self.columns) - 0.5)
@@ -63,7 +63,7 @@ class Matrix:
             ax.add_patch(_square(x, y, fill=False, ls=":", ec="#888888"))
             ax.annotate(_wrapped(entry.outcome), (x, y), ha="center", va="center", fontsize=6.5, style="italic")
             return
-        face = colormaps["cividis_r"](float(norm(max(entry.estimate.value, norm.vmin))))
+        face = colormaps["cividis_r"](float(norm(entry.estimate.value)))
         dark = np.dot(face[:3], (0.299, 0.587, 0.114)) < 0.55
         ax.add_patch(_square(x, y, fc=face, lw=0))
         text = f"{number(entry.estimate.value)}\n[{number(entry.estimate.low, 2)}, {number(entry.estimate.high, 2)}]"

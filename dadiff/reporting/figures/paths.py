@@ -130,7 +130,8 @@ def collect(
     methods = evidence.methods(cells)
     used = [m for m in methods if m.finished and "states" in m.finished[0].examples]
     shown, drawn = varying(methods), []
-    for robot in (robots or [None]) if used else []:
+    rows: list[int] | list[None] = robots or [None]
+    for robot in rows if used else []:
         scene, optimum = _scene(used[0], robot, case)
         paths = [_path(method, robot, case, shown, replay=apart) for method in used]
         title = "plans" if robot is None else f"robot {robot}"

@@ -39,7 +39,7 @@ LINES = {
 OTHER = ("#5b5bd6", "X")
 PANEL_WIDTH, PANEL_HEIGHT = 3.7, 2.75
 CHARACTER = 0.072  # inches that a character of a legend takes, about
-RC = {
+RC: dict[Any, Any] = {
     "svg.hashsalt": "dadiff",
     "svg.fonttype": "none",
     "pdf.fonttype": 42,
