@@ -126,7 +126,7 @@ def _gradient(L: Lagrangian, p: np.ndarray) -> np.ndarray:
 
 @pytest.fixture(scope="module", params=["default", "uniform", "hard"])
 def solved(request: pytest.FixtureRequest) -> tuple[ObstacleProblem, object]:
-    problem = draw(60, seed=3, distribution=request.param)
+    problem = draw(30, seed=3, distribution=request.param)
     return problem, batched.solve(problem)
 
 

@@ -18,7 +18,7 @@ _DRIFT = 0.75  # metres around p_0 + t v_0 for early waypoints
 _ANNULUS = (0.5, 2.0)  # metres from the target for late waypoints
 _ASIDE = 0.35  # metres, deviation along the path's normal of discs put on it
 _CLEAR_OF_POINTS, _CLEAR_OF_DISCS = 0.15, 0.3  # metres beyond the (inflated) radii
-_REDRAWS, _ROUNDS = 100, 50  # of one centre; of environments that found no place for one
+_REDRAWS, _ROUNDS = 100, 20  # of one centre; of environments that found no place for one
 
 
 @dataclass(frozen=True)

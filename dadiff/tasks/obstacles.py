@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 _EXPERTS = {"batched": batched.solve, "cvxpy": successive.solve, "ipopt": ipopt.solve}
-_NEAR = {"default": 0.6, "uniform": 0.0, "hard": 1.0}  # probability that a disc is put in the way
+_NEAR = {"default": 0.6, "uniform": 0.0, "hard": 0.9}  # probability that a centre is drawn in the way
 _ACTIVE = 1e-3  # metres from its inflated rim at which a disc counts as touched
 _SHOW_PROGRESS = 500  # environments from which on solving them shows a bar
 
@@ -49,7 +49,8 @@ class Obstacles:
         margin: by which the expert inflates discs, in metres; scores use the true discs.
         waypoint_weight: cost of a squared metre at a waypoint or the target.
         input_cost: rho, R = rho I. At 1e-4 the optimum passes waypoints within centimetres, as in the paper's figures.
-        distribution: "default" puts 60 % of the discs in the way, "uniform" none on purpose, "hard" all of the most.
+        distribution: "default" draws 60 % of the discs in the way, "uniform" none on purpose; "hard" draws as many as
+            there are slots, 90 % in the way.
         formulation: "constrained", or "literal" for the printed cost.
         expert: who solves the constrained problem.
     """

@@ -20,8 +20,9 @@ from dadiff.experts.obstacles.quadratic import batch_last, obstacle_free, select
 from dadiff.experts.obstacles.starts import encounters, other_side, subsets
 
 _CHUNK = 2500  # environments solved side by side: fewer waste calls, more leave the cache
-_PENALTY, _PENALTY_GROWTH, _ENOUGH_FALL = 1.0, 10.0, 0.25
+_PENALTY, _PENALTY_GROWTH, _ENOUGH_FALL = 3.0, 10.0, 0.25
 _SETTLED = 1e-10  # Newton decrement, in units of cost, at which multipliers move on
+_FORESEEN = 0.1  # share of L by which Newton's model may still lower it where a start is given up
 _ITERATIONS = 150
 _ARMIJO, _BACKTRACKS = 1e-4, 30
 _AT_MOST, _ROUNDS = 4, 3  # encounters that are flipped in combination; rounds of single flips
@@ -82,7 +83,7 @@ def _compete(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Solve environments `rows` (J,) from `start` (J, T+1, 2); returns those paths and the rows that got cheaper."""
     jobs = problem.take(rows)
-    positions, converged = minimise(jobs, start)
+    positions, converged = minimise(jobs, start, best.cost[rows])
     cost = np.where(converged & jobs.feasible(positions), jobs.cost(positions, jobs.inputs(positions)), np.inf)
     return positions, best.challenge(rows, positions, cost)
 
@@ -101,22 +102,32 @@ def _flip_sides(problem: ObstacleProblem, best: _Incumbents, rows: np.ndarray, p
         positions, largest = best.positions[rows], 1
 
 
-def minimise(problem: ObstacleProblem, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def minimise(
+    problem: ObstacleProblem, start: np.ndarray, ceiling: np.ndarray | float = np.inf
+) -> tuple[np.ndarray, np.ndarray]:
     """One local optimum of each environment, from `start` (N, T+1, 2) on.
+
+    The minimum of the augmented Lagrangian, with multipliers below their final values, lies below the cost of the
+    local optimum that it leads to. Who is above the ceiling there, or will be by Newton's model, is given up.
+
+    Args:
+        ceiling: a cost above which the optimum is of no use, (N,).
 
     Returns:
         Positions (N, T+1, 2), and (N,) whether the method converged there.
     """
     result, converged = start.copy(), np.zeros(problem.count, dtype=bool)
-    rows = np.arange(problem.count)
+    rows, ceiling = np.arange(problem.count), np.broadcast_to(ceiling, problem.count)
     L, p = Lagrangian.of(problem, _PENALTY), batch_last(start)
     violation = np.full(problem.count, np.inf)
     for _ in range(_ITERATIONS):
-        p, decrement = _descend(L, p)
+        p, value, decrement = _descend(L, p)
+        hopeless = (decrement <= _FORESEEN * value) & (value - 2 * decrement > ceiling[rows])
         L, violation, done = _update(L, p, decrement <= _SETTLED, violation)
-        if done.any():
+        if (leaving := done | hopeless).any():
+            done &= ~hopeless
             result[rows[done]], converged[rows[done]] = np.moveaxis(p[..., done], -1, 0), True
-            going = np.flatnonzero(~done)
+            going = np.flatnonzero(~leaving)
             rows, L, p, violation = rows[going], L.take(going), select(p, going), violation[going]
         if not len(rows):
             break
@@ -124,33 +135,33 @@ def minimise(problem: ObstacleProblem, start: np.ndarray) -> tuple[np.ndarray, n
     return result, converged
 
 
-def _descend(L: Lagrangian, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """One damped Newton step: the new p, and half the decrement g' H^-1 g before it, (N,)."""
+def _descend(L: Lagrangian, p: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """One damped Newton step: the new p, L there, and half the decrement g' H^-1 g before it, (N,)."""
     g, offset = L.constraint(p)
     s = L.force(g)
     gradient = L.gradient(p, s, offset)
     step = L.newton_step(gradient, s, offset)
     decrement = -(gradient * step).sum(axis=(0, 1)) / 2
-    return _backtrack(L, p, step, decrement), decrement
+    return *_backtrack(L, p, L.value(p, s), step, decrement), decrement
 
 
-def _backtrack(L: Lagrangian, p: np.ndarray, step: np.ndarray, decrement: np.ndarray) -> np.ndarray:
-    """p + a step with the first a = 1, 1/2, ... that decreases L enough (Armijo); environments apart."""
-    before, trial = L.value(p), p.copy()
+def _backtrack(
+    L: Lagrangian, p: np.ndarray, before: np.ndarray, step: np.ndarray, decrement: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """p + a step with the first a = 1, 1/2, ... that decreases L enough (Armijo), and L there; environments apart."""
+    size, slack = 1.0, 1e-12 * (1 + np.abs(before))  # slack for rounding, near convergence
+    trial = p.copy()
     trial[2:] += step
-    slack = 1e-12 * (1 + np.abs(before))  # rounding, near convergence
-    wrong = np.flatnonzero(L.value(trial) > before - 2 * _ARMIJO * decrement + slack)
-    size = 1.0
+    value = L.value(trial)
     for _ in range(_BACKTRACKS):
+        wrong = np.flatnonzero(value > before - 2 * _ARMIJO * size * decrement + slack)
         if not len(wrong):
             break
         size /= 2
         shorter = select(p, wrong)
         shorter[2:] += size * select(step, wrong)
-        trial[..., wrong] = shorter
-        value = L.take(wrong).value(shorter)
-        wrong = wrong[value > (before - 2 * _ARMIJO * size * decrement + slack)[wrong]]
-    return trial
+        trial[..., wrong], value[wrong] = shorter, L.take(wrong).value(shorter)
+    return trial, value
 
 
 def _update(

@@ -15,7 +15,7 @@ from dadiff.errors import MissingExtraError
 from dadiff.experts.obstacles.problem import TOLERANCE, ObstacleProblem, Solutions
 from dadiff.experts.obstacles.starts import best_of_starts
 
-_OPTIONS = {
+_OPTIONS: dict[str, Any] = {
     "ipopt.print_level": 0,
     "ipopt.sb": "yes",
     "print_time": False,
@@ -50,7 +50,7 @@ def _program(problem: ObstacleProblem) -> Callable[[ObstacleProblem, np.ndarray]
     cost = casadi.dot(weight, casadi.sum1((x[:2, :] - goal) ** 2).T) + problem.input_cost * casadi.sumsqr(u)
     gaps = [casadi.sum1((x[:2, 2:] - centre[:, j]) ** 2).T - radius[j] ** 2 for j in range(discs)]
     equalities = casadi.vertcat(x[:, 0] - x_init, casadi.vec(x[:, 1:] - following))
-    program = {
+    program: dict[str, Any] = {
         "x": casadi.vertcat(casadi.vec(x), casadi.vec(u)),
         "p": casadi.vertcat(x_init, casadi.vec(goal), weight, casadi.vec(centre), radius),
         "f": cost,

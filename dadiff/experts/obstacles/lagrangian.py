@@ -59,9 +59,9 @@ class Lagrangian:
         """s = max(0, lambda + mu g), (K, O, N): what the discs push back with, and the next multipliers."""
         return np.maximum(self.multiplier + self.penalty * g, 0)
 
-    def value(self, p: np.ndarray) -> np.ndarray:
-        """L, (N,)."""
-        s = self.force(self.constraint(p)[0])
+    def value(self, p: np.ndarray, s: np.ndarray | None = None) -> np.ndarray:
+        """L, (N,), with s at p where it is known."""
+        s = self.force(self.constraint(p)[0]) if s is None else s
         return self.f.value(p) + (s**2 - self.multiplier**2).sum(axis=(0, 1)) / (2 * self.penalty)
 
     def gradient(self, p: np.ndarray, s: np.ndarray, offset: np.ndarray) -> np.ndarray:

@@ -96,10 +96,10 @@ def straight_lines(problem: ObstacleProblem) -> np.ndarray:
     """From p(1) to goal after goal at constant speed, (1, T+1, 2), for one environment."""
     positions = np.zeros((1, problem.horizon + 1, 2))
     positions[:, :2] = problem.start
-    due = [1, *(t for t in np.flatnonzero(problem.weight[0]) if t > 1)]
-    corners = np.concatenate([problem.start[:, 1], problem.goal[0, due[1:]]])
+    due = 2 + np.flatnonzero(problem.weight[0, 2:])
+    corners = np.concatenate([problem.start[:, 1], problem.goal[0, due]])
     t = np.arange(2, problem.horizon + 1)
-    positions[0, 2:] = np.stack([np.interp(t, due, corners[:, axis]) for axis in range(2)], axis=1)
+    positions[0, 2:] = np.stack([np.interp(t, [1, *due], corners[:, axis]) for axis in range(2)], axis=1)
     return positions
 
 

@@ -60,7 +60,7 @@ class _Program:
             slack = cp.Variable(T - 1, nonneg=True)
             constraints.append(cp.sum(cp.multiply(normal, p[2:]), axis=1) + slack >= offset)
             cost += _SLACK_PRICE * cp.sum(slack)
-        named = {"root_weight": root_weight, "anchor": anchor, "x_init": x_init, "reference": reference}
+        named: dict[str, Any] = {"root_weight": root_weight, "anchor": anchor, "x_init": x_init, "reference": reference}
         named |= {"region": region, "normals": normals, "offsets": offsets}
         return cls(cp.Problem(cp.Minimize(cost), constraints), p, named)
 

@@ -1,0 +1,78 @@
+"""The three experts agree: `batched` is held against the other two, which share nothing with it but the starts."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import pytest
+
+from dadiff.errors import MissingExtraError
+from dadiff.experts.obstacles import batched, ipopt, successive
+from dadiff.experts.obstacles.problem import ObstacleProblem, Status
+from dadiff.experts.obstacles.quadratic import obstacle_free
+from dadiff.experts.obstacles.starts import best_of_starts, many_starts
+from dadiff.tasks.obstacles import Obstacles
+
+
+def draw(count: int, seed: int, **settings: object) -> ObstacleProblem:
+    task = Obstacles(**settings)  # type: ignore[arg-type]
+    environments, _ = task.distribution_for(0.1).sample(count, np.random.default_rng(seed))
+    return task.problem(environments, 0.1)
+
+
+def off_centre_disc() -> ObstacleProblem:
+    """A disc beside a straight run: one local optimum is much cheaper, and every start leads to it."""
+    weight, goal = np.zeros((1, 31)), np.zeros((1, 31, 2))
+    weight[0, [15, 30]] = 1.0
+    goal[0, 15], goal[0, 30] = [1.5, -0.05], [3.0, 0.0]
+    x_init = np.array([[0.0, 0, 1, 0]])
+    return ObstacleProblem(x_init, goal, weight, np.array([[[1.5, 0.4]]]), np.array([[0.55]]), 1e-3, 0.1)
+
+
+def test_all_three_agree_where_there_is_one_local_optimum() -> None:
+    problem = off_centre_disc()
+    assert not problem.feasible(obstacle_free(problem))[0]
+    found = [expert.solve(problem) for expert in (batched, successive, ipopt)]
+    for other in found[1:]:
+        assert other.solved.all()
+        np.testing.assert_allclose(other.cost, found[0].cost, rtol=1e-4)
+        np.testing.assert_allclose(other.positions, found[0].positions, atol=2e-3)
+
+
+def test_starts_pass_a_disc_on_both_sides() -> None:
+    starts = many_starts(off_centre_disc())
+    np.testing.assert_allclose(starts[:, 1], starts[:1, 1].repeat(len(starts), axis=0))
+    assert {True, False} <= set((starts[:, 15, 1] > 0.4).tolist())
+
+
+def test_the_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "casadi", None)
+    with pytest.raises(MissingExtraError, match=r"pip install 'dadiff\[ipopt\]'"):
+        ipopt.solve(off_centre_disc())
+
+
+def test_an_environment_that_no_start_solves_is_said() -> None:
+    problem = off_centre_disc()
+    failing = best_of_starts(problem, lambda one, start: None, progress=False)
+    np.testing.assert_array_equal(failing.status, [Status.NOT_CONVERGED])
+    through = best_of_starts(problem, lambda one, start: obstacle_free(one)[0], progress=False)
+    assert not through.solved.any()
+
+
+@pytest.mark.slow
+def test_batched_is_never_worse_than_successive_convexification_from_several_starts() -> None:
+    problem = draw(50, seed=11)
+    found, reference = batched.solve(problem), successive.solve(problem)
+    assert found.solved.all()
+    assert reference.solved.all()
+    assert (found.cost <= 1.01 * reference.cost).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("distribution", "share"), [("default", 0.99), ("hard", 0.95)])
+def test_batched_is_nearly_always_as_good_as_ipopt_from_several_starts(distribution: str, share: float) -> None:
+    problem = draw(60, seed=12, distribution=distribution)
+    found, reference = batched.solve(problem), ipopt.solve(problem)
+    assert found.solved.all()
+    assert (found.cost <= 1.01 * reference.cost).mean() >= share
