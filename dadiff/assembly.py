@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -60,16 +60,25 @@ class Experiment:
         return self.target.layout(self.parts["task"].horizon)
 
     @cached_property
-    def data(self) -> tuple[Demonstrations, Cases]:
-        """Demonstrations and cases, from the cache or made now."""
-        return load_data(self._cached(self.identity.dataset, self._build_dataset))
+    def demonstrations(self) -> Demonstrations:
+        """What is learned from: from the cache, or made now."""
+        draw = self.parts["dataset"].train
+        build = partial(save_data, draw=lambda: draw(self.parts["task"], self.parts["system"]))
+        return Demonstrations(**load_data(self._cached(self.identity.demonstrations, build)))
+
+    @cached_property
+    def cases(self) -> Cases:
+        """What is planned for: from the cache, or made now."""
+        draw = self.parts["dataset"].test
+        build = partial(save_data, draw=lambda: draw(self.parts["task"], self.target))
+        return Cases(**load_data(self._cached(self.identity.cases, build)))
 
     @cached_property
     def coordinates(self) -> Coordinates:
         """Where diffusion and projection act."""
         if self.parts.settings.coordinates == "physical":
             return physical(self.layout)
-        return standardised(self.layout, self.data[0].trajectories)
+        return standardised(self.layout, self.demonstrations.trajectories)
 
     @cached_property
     def device(self) -> str:
@@ -90,12 +99,12 @@ class Experiment:
         if not recipe.trainable:
             return recipe.exact(self._law(), self.coordinates, schedule)
         folder = self._cached(self.identity.denoiser, self._train, resumable=True)
-        environment_dim = self.data[0].environment.shape[-1]
+        environment_dim = self.cases.environment.shape[-1]
         return load(folder / "model.safetensors", recipe, self.layout, environment_dim, schedule).to(self.device)
 
     def prepare(self) -> None:
         """Build what is shared with other runs."""
-        _ = self.data, self.denoiser
+        _ = self.demonstrations, self.cases, self.denoiser
 
     def _law(self) -> Any:
         task = self.parts["task"]
@@ -108,12 +117,8 @@ class Experiment:
             artefact.kind, artefact.key, artefact.determined_by, build, resumable=resumable
         )
 
-    def _build_dataset(self, folder: Path) -> None:
-        dataset, task, system = self.parts["dataset"], self.parts["task"], self.parts["system"]
-        save_data(folder, dataset.train(task, system), dataset.test(task, self.target))
-
     def _train(self, folder: Path) -> None:
-        demonstrations = self.data[0]
+        demonstrations = self.demonstrations
         train(
             self.parts["denoiser"],
             self.layout,

@@ -22,7 +22,7 @@ FORMAT = 1  # raised whenever a change moves results; see CHANGELOG
 
 @dataclass(frozen=True)
 class Artefact:
-    """A cached thing: its kind ("dataset", "recording", "denoiser"), what determines it, and the hash of that."""
+    """A cached thing: its kind ("demonstrations", "cases", "denoiser", ...), what determines it, and the hash of that."""
 
     kind: str
     determined_by: dict[str, Any]
@@ -41,13 +41,15 @@ class Identity:
         determined_by: everything that can change the result.
         name: for people; two runs may share it.
         axes: flat parameters, the choice of each group under the group's name.
-        dataset, denoiser: None stands for nothing to build.
+        demonstrations, cases: the two parts of the data set.
+        denoiser, recording: None stands for nothing to build.
     """
 
     determined_by: dict[str, Any]
     name: str
     axes: dict[str, Any]
-    dataset: Artefact
+    demonstrations: Artefact
+    cases: Artefact
     denoiser: Artefact | None
     recording: Artefact | None
 
@@ -74,20 +76,24 @@ def identify(config: Mapping[str, Any], parts: Parts | None = None) -> Identity:
         ConfigError: if the configuration is not valid.
     """
     parts = parts or assemble(config, config.get("choices"))
-    nodes = {group: _content(parts[group], node) for group, node in complete(config).items() if group in GROUPS}
+    given = {group: node for group, node in complete(config).items() if group in GROUPS}
+    nodes = {group: _content(parts[group], node) for group, node in given.items()}
     matters = _groups_that_matter(parts)
     coordinates = parts.settings.coordinates
-    dataset = Artefact("dataset", {"format": FORMAT, **{g: nodes[g] for g in ("system", "task", "dataset")}})
-    trained = {"dataset": dataset.key, "coordinates": coordinates}
+    expert = {"format": FORMAT, "system": nodes["system"], "task": nodes["task"]}
+    demonstrations = Artefact("demonstrations", expert | {"dataset": nodes["dataset"]["train"]})
+    cases = Artefact("cases", expert | {"dataset": nodes["dataset"]["test"]})
+    trained = {"demonstrations": demonstrations.key, "coordinates": coordinates}
     denoiser = Artefact("denoiser", trained | {g: nodes[g] for g in ("schedule", "denoiser", "training")})
-    recording = Artefact("recording", {"format": FORMAT, **{g: nodes[g] for g in ("system", "task", "recording")}})
+    recording = Artefact("recording", expert | {"recording": nodes["recording"]})
     determined_by = {"format": FORMAT, "coordinates": coordinates, **{g: nodes[g] for g in matters}}
     choices = {g: parts.settings.choices.get(g, nodes[g][TARGET].rpartition(".")[2].lower()) for g in matters}
     return Identity(
         determined_by,
         _name(choices, nodes, parts),
-        _axes(choices, nodes, parts),
-        dataset,
+        _axes(choices, given, parts),
+        demonstrations,
+        cases,
         denoiser if parts["denoiser"].trainable else None,
         recording if "recording" in matters else None,
     )
@@ -105,7 +111,9 @@ def _groups_that_matter(parts: Parts) -> list[str]:
 
 
 def _content(component: Any, node: Mapping[str, Any]) -> dict[str, Any]:
-    """The node, with what its files hold in place of their path."""
+    """The node; of data from files, what they hold in place of their path; of a data set, its two parts."""
+    if hasattr(component, "determined_by"):
+        return {TARGET: node[TARGET], **{part: component.determined_by(part) for part in ("train", "test")}}
     if not hasattr(component, "fingerprint"):
         return dict(node)
     return {**{k: v for k, v in node.items() if k != "path"}, "content": component.fingerprint()}

@@ -75,7 +75,7 @@ def first(root):
 def test_a_plan_has_each_key_once_and_builds_what_is_shared_first(tmp_path):
     plan = make_plan(configs(tmp_path))
     assert [cell.copies for cell in plan.cells] == [1, 2, 1]
-    assert [p.artefact.kind for p in plan.preparations] == ["dataset", "denoiser"]
+    assert [p.artefact.kind for p in plan.preparations] == ["demonstrations", "denoiser"]
     dataset, denoiser = (p.artefact.key for p in plan.preparations)
     assert plan.preparations[1].needs == {dataset}
     assert plan.needs(plan.cells[0]) == {dataset, denoiser}
@@ -93,7 +93,7 @@ def test_what_succeeds_is_stored_and_what_fails_is_recorded_with_its_reason(firs
     assert "S" in sweep.cells[2].reason
     failed = Results(root).read(sweep.cells[2].key)
     assert (failed.status, failed.record["reason"]) == ("failed", sweep.cells[2].reason)
-    assert [entry.kind for entry in Cache(root).entries()] == ["dataset", "denoiser"]
+    assert [entry.kind for entry in Cache(root).entries()] == ["cases", "demonstrations", "denoiser"]
     assert len(outcomes) == 5
     text = summary(sweep, 0, run.folder)
     assert "2 finished, 1 failed" in text

@@ -1,32 +1,26 @@
-"""A data set on disk: demonstrations and cases in one folder, as plain arrays and notes."""
+"""A part of a data set on disk: plain arrays and notes."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from dadiff.tasks import Cases, Demonstrations
 
 
-def save_data(folder: Path, train: Demonstrations, test: Cases) -> None:
-    """Write both into `data.npz` and `notes.json`."""
-    np.savez(
-        folder / "data.npz",
-        trajectories=train.trajectories,
-        environment=train.environment,
-        test_environment=test.environment,
-        test_x_init=test.x_init,
-        test_reference=test.reference,
-    )
-    (folder / "notes.json").write_text(json.dumps({"train": train.notes, "test": test.notes}, indent=1) + "\n")
+def save_data(folder: Path, draw: Callable[[], Demonstrations | Cases]) -> None:
+    """Draw, and write the arrays into `data.npz` and the notes into `notes.json`."""
+    fields = asdict(draw())
+    (folder / "notes.json").write_text(json.dumps(fields.pop("notes"), indent=1) + "\n")
+    np.savez(folder / "data.npz", **fields)
 
 
-def load_data(folder: Path) -> tuple[Demonstrations, Cases]:
-    """What `save_data` wrote."""
-    notes = json.loads((folder / "notes.json").read_text())
+def load_data(folder: Path) -> dict[str, Any]:
+    """The fields that `save_data` wrote."""
     with np.load(folder / "data.npz", allow_pickle=False) as data:
-        train = Demonstrations(data["trajectories"], data["environment"], notes["train"])
-        test = Cases(data["test_environment"], data["test_x_init"], data["test_reference"], notes["test"])
-    return train, test
+        return {**data, "notes": json.loads((folder / "notes.json").read_text())}

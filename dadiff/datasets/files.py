@@ -12,9 +12,11 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from dadiff.datasets.generated import Part
 from dadiff.errors import ConfigError, DataError
 from dadiff.systems import LinearSystem, Recording
 from dadiff.tasks import Cases, Demonstrations, Task
@@ -101,11 +103,10 @@ class NpzTrajectories:
     train_size: int | None = None
     test_size: int | None = None
 
-    def fingerprint(self) -> str:
+    def determined_by(self, part: Part) -> dict[str, Any]:
         """What the folder holds, in place of where it lies."""
-        for part in ("train", "test"):
-            list_files(Path(self.path) / part)
-        return fingerprint(Path(self.path))
+        list_files(folder := Path(self.path) / part)
+        return {"content": fingerprint(folder), "size": self.train_size if part == "train" else self.test_size}
 
     def train(self, task: Task, system: LinearSystem) -> Demonstrations:
         """The trajectories of `path`/train."""

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, Literal
 
 from dadiff.errors import ConfigError
 from dadiff.randomness import numpy_generator
 from dadiff.systems import LinearSystem
 from dadiff.tasks import Cases, Demonstrations, Task
+
+Part = Literal["train", "test"]
 
 
 @dataclass(frozen=True)
@@ -27,6 +30,10 @@ class Generated:
     def __post_init__(self) -> None:
         if self.train_size < 1 or self.test_size < 1:
             raise ConfigError(f"dataset: train_size is {self.train_size}, test_size {self.test_size}; need at least 1")
+
+    def determined_by(self, part: Part) -> dict[str, Any]:
+        """What the demonstrations or the cases depend on."""
+        return {"generated": self.train_size if part == "train" else self.test_size, "seed": self.seed}
 
     def train(self, task: Task, system: LinearSystem) -> Demonstrations:
         """`train_size` demonstrations."""

@@ -96,17 +96,17 @@ def _planned(config: dict[str, Any], identity: Identity, copies: int) -> Planned
 def _preparations(cells: Sequence[PlannedCell]) -> list[Preparation]:
     """Data sets before trainings; each once, with the configuration of the first cell that needs it."""
     found: dict[str, Preparation] = {}
-    for kind in ("dataset", "denoiser"):
+    for kind in ("demonstrations", "denoiser"):
         for cell in cells:
             artefact = getattr(cell.identity, kind)
             if artefact and not Cache(cell.config["output_dir"]).contains(kind, artefact.key):
-                before = frozenset(found) & {cell.identity.dataset.key} - {artefact.key}
+                before = frozenset(found) & {cell.identity.demonstrations.key} - {artefact.key}
                 found.setdefault(artefact.key, Preparation(artefact, cell.config, before))
     return list(found.values())
 
 
 def _keys(identity: Identity) -> set[str]:
-    return {artefact.key for artefact in (identity.dataset, identity.denoiser) if artefact}
+    return {artefact.key for artefact in (identity.demonstrations, identity.denoiser) if artefact}
 
 
 def describe(plan: Plan) -> str:
