@@ -6,7 +6,7 @@ everywhere, also where alpha_bar_L = 0.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from math import prod, sqrt
 from typing import Literal, Protocol
@@ -48,7 +48,7 @@ class DDPM:
         last_step_noise: as in Algorithm 1, which adds sqrt(beta_1) eps to the final plan too.
         variance: sigma_i^2 is beta_i (the paper's) or the posterior's beta_i (1 - alpha_bar_{i-1}) / (1 - alpha_bar_i).
         skip_below: bound on the total weight of the clean estimates that are not computed: the sample at the first
-            call differs by at most skip_below * max |tau0_hat|. 0 calls the network at every step.
+            call differs by at most skip_below * max |tau0_hat|. 0 leaves out calls of no weight only.
     """
 
     last_step_noise: bool = True
@@ -114,16 +114,15 @@ class DDIM:
 def _skip(steps: list[Step], bound: float) -> list[Step]:
     """Mark the leading steps whose clean estimates enter the sample with a total weight of at most `bound`.
 
-    After steps 1..k that weight is W_k = sample_k W_{k-1} + clean_k.
+    After steps 1..k that weight is W_k = sample_k W_{k-1} + clean_k. It ends at 1, above any bound: the last step's
+    mean is the clean estimate.
     """
-    marked: list[Step] = []
     weight = 0.0
-    for step in steps:
+    for k, step in enumerate(steps):
         weight = step.sample * weight + step.clean
         if weight > bound:
-            return marked + steps[len(marked) :]
-        marked.append(Step(step.i, step.j, step.clean, step.sample, step.noise, call=False))
-    raise ConfigError(f"sampler: skip_below = {bound:g} would skip every network call; lower it")
+            return [replace(skipped, call=False) for skipped in steps[:k]] + steps[k:]
+    return steps
 
 
 def skipped_weight(steps: list[Step]) -> float:

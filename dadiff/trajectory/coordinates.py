@@ -57,13 +57,13 @@ def standardised(layout: Layout, trajectories: np.ndarray) -> Coordinates:
 
     One scale a channel, not an entry: entries that never vary, such as u(T-1) = 0, would have none.
     """
-    states, inputs = layout.split(trajectories)
-    mean = [x.reshape(-1, x.shape[-1]).mean(axis=0) for x in (states, inputs)]
-    scale = [x.reshape(-1, x.shape[-1]).std(axis=0) for x in (states, inputs)]
-    scale = [np.where(s > 0, s, 1.0) for s in scale]
+    channels = [x.reshape(-1, x.shape[-1]) for x in layout.split(trajectories)]
+    mean = [x.mean(axis=0) for x in channels]
+    # The deviation of a constant is 0 up to rounding only; its range is exactly 0.
+    scale = [np.where(np.ptp(x, axis=0) > 0, x.std(axis=0), 1.0) for x in channels]
     steps = (layout.horizon + 1, layout.horizon)
 
-    def spread(channels: list[np.ndarray]) -> np.ndarray:
-        return layout.flatten(*(np.tile(c, (k, 1)) for c, k in zip(channels, steps, strict=True)))
+    def spread(values: list[np.ndarray]) -> np.ndarray:
+        return layout.flatten(*(np.tile(v, (k, 1)) for v, k in zip(values, steps, strict=True)))
 
     return Coordinates(spread(mean), spread(scale))

@@ -1,0 +1,217 @@
+"""Laws of the LQR expert and its task: optimality, by a solver and by its conditions, and the exact law."""
+
+from __future__ import annotations
+
+import cvxpy as cp
+import numpy as np
+import pytest
+from laws import fleet, members
+
+from dadiff.errors import ConfigError, InfeasibleError
+from dadiff.experts.lqr import closed_loop_law, optimal_feedback, stationary_feedback
+from dadiff.randomness import numpy_generator
+from dadiff.systems import LinearSystem, double_integrator
+from dadiff.tasks import LQR
+from dadiff.trajectory.response import along
+
+
+def task_for(system: LinearSystem, horizon: int = 12, **options) -> LQR:
+    return LQR(horizon=horizon, state_cost=tuple(np.linspace(10, 1, system.state_dim)), **options)
+
+
+def optimum(system: LinearSystem, task: LQR, count: int = 3) -> tuple[np.ndarray, np.ndarray]:
+    """(environment, noise-free optimal trajectories) of a few cases."""
+    cases = task.cases(system, count, numpy_generator(0, "test"))
+    return cases.environment, cases.reference
+
+
+def follow(system: LinearSystem, feedback, x_init: np.ndarray, target: np.ndarray) -> np.ndarray:
+    x, states, inputs = x_init, [x_init], []
+    for t in range(feedback.horizon):
+        inputs.append(feedback.K[t] @ x + feedback.L[t] @ target)
+        x = system.A @ x + system.B @ inputs[-1]
+        states.append(x)
+    return system.layout(feedback.horizon).flatten(np.array(states), np.array(inputs))
+
+
+def test_the_affine_optimum_is_the_qps(system):
+    task = task_for(system)
+    (environment,), (tau,) = optimum(system, task, count=1)
+    n, T = system.state_dim, task.horizon
+    x, u = cp.Variable((T + 1, n)), cp.Variable((T, system.input_dim))
+    weights = np.sqrt(np.diag(task.Q))
+    cost = cp.sum_squares(cp.multiply(x[:-1] - environment[None, n:], weights[None])) + cp.sum_squares(u)
+    dynamics = [x[0] == environment[:n], x[1:] == x[:-1] @ system.A.T + u @ system.B.T]
+    problem = cp.Problem(cp.Minimize(cost), dynamics)
+    problem.solve(solver=cp.CLARABEL, tol_gap_abs=1e-12, tol_gap_rel=1e-12, tol_feas=1e-12)
+    states, inputs = system.layout(T).split(tau)
+    np.testing.assert_allclose(states, x.value, atol=1e-6)
+    np.testing.assert_allclose(inputs, u.value, atol=1e-6)
+    np.testing.assert_allclose(task.cost(system, tau, environment[n:]), problem.value, rtol=1e-8)
+
+
+def test_the_gradient_of_the_cost_vanishes_at_the_optimum(system):
+    """With lambda(t) = 2 Q (x(t) - target) + A' lambda(t+1), lambda(T) = 0: 2 R u(t) + B' lambda(t+1) = 0."""
+    task = task_for(system)
+    environment, tau = optimum(system, task)
+    states, inputs = system.layout(task.horizon).split(tau)
+    multiplier = np.zeros_like(states[:, 0])
+    for t in reversed(range(task.horizon)):
+        gradient = 2 * inputs[:, t] @ task.R(system) + multiplier @ system.B
+        np.testing.assert_allclose(gradient, 0, atol=1e-10 * max(1, np.abs(multiplier).max()))
+        multiplier = 2 * (states[:, t] - environment[:, system.state_dim :]) @ task.Q + multiplier @ system.A
+
+
+def test_the_last_input_is_0_since_nothing_costs_at_T(system):
+    task = task_for(system)
+    _, tau = optimum(system, task)
+    assert np.abs(system.layout(task.horizon).inputs(tau)[:, -1]).max() < 1e-14
+
+
+def test_no_perturbation_of_the_inputs_is_cheaper(system, rng):
+    task = task_for(system)
+    environment, tau = optimum(system, task)
+    layout, target = system.layout(task.horizon), environment[:, system.state_dim :]
+    best = task.cost(system, tau, target)
+    for scale in (1e-3, 1.0):
+        inputs = layout.inputs(tau) + scale * rng.standard_normal((*tau.shape[:-1], task.horizon, system.input_dim))
+        other = layout.flatten(system.simulate(environment[:, : system.state_dim], inputs), inputs)
+        assert (task.cost(system, other, target) > best).all()
+
+
+def test_for_long_horizons_the_gain_is_that_of_dlqr(system):
+    Q, R = np.diag(np.linspace(10, 1, system.state_dim)), np.eye(system.input_dim)
+    finite, infinite = optimal_feedback(system, Q, R, 300), stationary_feedback(system, Q, R, 1)
+    np.testing.assert_allclose(finite.K[0], infinite.K[0], rtol=1e-9, atol=1e-9)
+
+
+def test_the_stationary_expert_steers_by_the_deviation_from_the_target(system):
+    Q, R = np.eye(system.state_dim), np.eye(system.input_dim)
+    feedback = stationary_feedback(system, Q, R, 5)
+    assert feedback.horizon == 5
+    assert np.array_equal(feedback.L, -feedback.K)
+    assert (feedback.K[0] == feedback.K).all()
+
+
+@pytest.mark.parametrize("solve", [optimal_feedback, stationary_feedback])
+def test_a_fleet_is_its_robots_one_by_one(solve):
+    robots, (Q, R) = fleet(), (np.diag([3.0, 2.0, 1.0]), np.eye(2))
+    together, law = solve(robots, Q, R, 8), closed_loop_law(robots, solve(robots, Q, R, 8))
+    for k, robot in enumerate(members(robots)):
+        alone = solve(robot, Q, R, 8)
+        np.testing.assert_allclose(together.K[k], alone.K, atol=1e-12)
+        np.testing.assert_allclose(together.L[k], alone.L, atol=1e-12)
+        np.testing.assert_allclose(law.mean_map[k], closed_loop_law(robot, alone).mean_map, atol=1e-12)
+        np.testing.assert_allclose(law.noise_map[k], closed_loop_law(robot, alone).noise_map, atol=1e-12)
+
+
+def test_a_horizon_that_overflows_is_an_infeasible_problem():
+    system = LinearSystem([[1e200]], [[1e-200]])
+    with pytest.raises(
+        InfeasibleError, match="the Riccati recursion of the system leaves float range over horizon T = 9"
+    ):
+        optimal_feedback(system, np.eye(1), np.eye(1), 9)
+
+
+# --- the law
+
+
+def test_the_mean_is_the_closed_loop_without_noise(system):
+    task = task_for(system)
+    environment, tau = optimum(system, task)
+    for E, expected in zip(environment, tau, strict=True):
+        x_init, target = np.split(E, 2)
+        np.testing.assert_allclose(follow(system, task.feedback(system), x_init, target), expected, atol=1e-11)
+
+
+def test_demonstrations_have_the_laws_mean_and_covariance(system):
+    task, law = task_for(system, horizon=4), task_for(system, horizon=4).law(system)
+    count = 20_000
+    demonstrations = task.demonstrations(system, count, numpy_generator(0, "test"))
+    deviation = demonstrations.trajectories - along(law.mean_map, demonstrations.environment)
+    sigma = np.sqrt(np.diag(law.covariance))
+    assert (np.abs(deviation.mean(axis=0)) <= 5 * sigma / np.sqrt(count) + 1e-12).all()
+    spread = np.outer(sigma, sigma)
+    error = np.abs(deviation.T @ deviation / count - law.covariance)
+    assert (error <= 5 * np.sqrt(2 / count) * spread + 1e-15).all()
+
+
+def test_the_laws_covariance_is_that_of_the_closed_loop_step_by_step(system):
+    """Sigma_x(t+1) = (A + BK) Sigma_x(t) (A + BK)' + std^2 I from Sigma_x(0) = 0."""
+    task = task_for(system)
+    feedback, law = task.feedback(system), task.law(system)
+    layout = system.layout(task.horizon)
+    covariance = np.zeros((system.state_dim, system.state_dim))
+    for t in range(task.horizon + 1):
+        block = layout.states(law.noise_map.T)[:, t]
+        np.testing.assert_allclose(block.T @ block, covariance, atol=1e-13)
+        if t < task.horizon:
+            closed = system.A + system.B @ feedback.K[t]
+            covariance = closed @ covariance @ closed.T + system.process_noise**2 * np.eye(system.state_dim)
+
+
+def test_every_demonstration_starts_at_x_init_and_is_feedback(system):
+    task = task_for(system)
+    made = task.demonstrations(system, 5, numpy_generator(0, "test"))
+    states, inputs = system.layout(task.horizon).split(made.trajectories)
+    x_init, target = np.split(made.environment, 2, axis=-1)
+    feedback = task.feedback(system)
+    np.testing.assert_allclose(states[:, 0], x_init, atol=1e-14)
+    for t in range(task.horizon):
+        np.testing.assert_allclose(inputs[:, t], states[:, t] @ feedback.K[t].T + target @ feedback.L[t].T, atol=1e-11)
+
+
+# --- the task
+
+
+def test_environments_are_uniform_in_the_papers_ranges():
+    E = LQR().sample_environments(double_integrator(), (5000,), numpy_generator(0, "test"))
+    x_init, target = np.split(E, 2, axis=-1)
+    for values, bound in ((x_init, 1.0), (target, 4.0)):
+        assert np.abs(values).max() <= bound
+        np.testing.assert_allclose(values.std(axis=0), bound / np.sqrt(3), rtol=0.05)
+
+
+def test_a_realised_reference_is_one_noisy_run():
+    system, seed = double_integrator(), 0
+    mean, realised = (
+        LQR(reference=choice).cases(system, 4, numpy_generator(seed, "test")) for choice in ("mean", "realised")
+    )
+    assert np.array_equal(mean.environment, realised.environment)
+    gap = np.abs(mean.reference - realised.reference).max(axis=-1)
+    assert ((gap > 1e-3) & (gap < 1)).all()
+
+
+def test_the_cost_ratio_is_1_at_the_optimum_and_more_elsewhere(system, rng):
+    task = task_for(system)
+    cases = task.cases(system, 4, numpy_generator(0, "test"))
+    planned = cases.reference[:, None].repeat(3, axis=1)
+    ratio = task.score(system, cases, planned, planned).per_plan["cost_ratio"]
+    assert ratio.shape == (4, 3)
+    np.testing.assert_allclose(ratio, 1, rtol=1e-12)
+    stationary = task_for(system, expert="stationary")
+    theirs = stationary.cases(system, 4, numpy_generator(0, "test")).reference[:, None]
+    assert (stationary.score(system, cases, theirs, theirs).per_plan["cost_ratio"] >= 1 - 1e-12).all()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"horizon": 0},
+        {"state_cost": (1.0, -1.0, 1.0, 1.0)},
+        {"state_cost": (1.0, float("nan"), 1.0, 1.0)},
+        {"input_cost": 0.0},
+        {"input_cost": float("nan")},
+        {"init_range": -1.0},
+        {"target_range": float("inf")},
+    ],
+)
+def test_values_out_of_range_are_refused_in_one_line(options):
+    with pytest.raises(ConfigError, match=r"^task: [^\n]*$"):
+        LQR(**options)
+
+
+@pytest.mark.parametrize("state_cost", [(), (1.0, 1.0, 1.0)])
+def test_one_weight_a_state(state_cost):
+    with pytest.raises(ConfigError, match=rf"state_cost has {len(state_cost)} entries, the system 4 states"):
+        LQR(state_cost=state_cost).feedback(double_integrator())

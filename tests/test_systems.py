@@ -1,0 +1,135 @@
+"""Laws of systems and recordings: the paper's A and B, the noise they are given, and what is refused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from laws import fleet, members, tolerance
+from scipy.linalg import expm
+
+from dadiff.errors import ConfigError, ExcitationError, ShapeError
+from dadiff.projectors import identify
+from dadiff.systems import GaussianExcitation, LinearSystem, Recording, double_integrator
+
+
+def test_A_and_B_are_the_papers():
+    system = double_integrator()
+    I, O = np.eye(2), np.zeros((2, 2))  # noqa: E741
+    assert np.array_equal(system.A, np.block([[I, 0.1 * I], [O, I]]))
+    assert np.array_equal(system.B, np.vstack([O, 0.1 * I]))
+    assert system.process_noise == 0.01
+
+
+@pytest.mark.parametrize("axes", [1, 2, 3])
+def test_zero_order_hold_is_the_matrix_exponential(axes):
+    system = double_integrator(axes, time_step=0.3, discretisation="zoh")
+    I, O = np.eye(axes), np.zeros((axes, axes))  # noqa: E741
+    exact = expm(0.3 * np.block([[O, I, O], [O, O, I], [O, O, O]]))
+    np.testing.assert_allclose(system.A, exact[: 2 * axes, : 2 * axes], atol=1e-14)
+    np.testing.assert_allclose(system.B, exact[: 2 * axes, 2 * axes :], atol=1e-14)
+
+
+def test_the_process_noise_has_its_deviation(rng):
+    w = double_integrator(process_noise=0.05).sample_noise(rng, (4000,))
+    assert w.shape == (4000, 4)
+    np.testing.assert_allclose(w.std(axis=0), 0.05, rtol=0.05)
+    per_state = LinearSystem(np.eye(2), np.ones((2, 1)), np.array([0.0, 3.0])).sample_noise(rng, (4000,))
+    assert (per_state[:, 0] == 0).all()
+    np.testing.assert_allclose(per_state[:, 1].std(), 3, rtol=0.05)
+
+
+@pytest.mark.parametrize(
+    ("A", "B", "message"),
+    [
+        (np.ones((2, 3)), np.ones((2, 1)), r"A has shape \(2, 3\)"),
+        (np.eye(3), np.ones((2, 1)), r"B \(2, 1\)"),
+        (np.eye(2), np.ones(2), r"B \(2,\)"),
+        (np.ones((5, 2, 2)), np.ones((4, 2, 1)), r"expected \(\.\.\., n, n\) and \(\.\.\., n, m\)"),
+    ],
+)
+def test_matrices_that_do_not_fit_are_refused(A, B, message):
+    with pytest.raises(ShapeError, match=message):
+        LinearSystem(A, B)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: double_integrator(axes=0),
+        lambda: double_integrator(time_step=0.0),
+        lambda: double_integrator(time_step=float("nan")),
+        lambda: double_integrator(process_noise=-0.1),
+        lambda: double_integrator(process_noise=float("nan")),
+        lambda: double_integrator(process_noise=float("inf")),
+        lambda: LinearSystem([[np.nan]], [[1.0]]),
+        lambda: GaussianExcitation(length=0),
+        lambda: GaussianExcitation(count=0),
+        lambda: GaussianExcitation(input_std=float("nan")),
+        lambda: GaussianExcitation(process_noise=-1.0),
+    ],
+)
+def test_values_out_of_range_are_refused_in_one_line(make):
+    with pytest.raises(ConfigError, match=r"^(system|recording): [^\n]*$"):
+        make()
+
+
+def test_a_recording_obeys_the_dynamics_and_starts_from_rest(system):
+    recording = GaussianExcitation(length=50, process_noise=0.0, count=3).record(system)
+    assert (recording.length, recording.count) == (50, 3)
+    assert recording.states.shape == (3, 51, system.state_dim)
+    assert (recording.states[:, 0] == 0).all()
+    np.testing.assert_allclose(system.simulate(recording.states[:, 0], recording.inputs), recording.states, atol=1e-12)
+
+
+def test_a_recording_takes_the_systems_noise_unless_told_otherwise():
+    def residual(process_noise: float | None) -> float:
+        recording = GaussianExcitation(length=4000, process_noise=process_noise).record(system)
+        x, u = recording.states[0], recording.inputs[0]
+        return float((x[1:] - x[:-1] @ system.A.T - u @ system.B.T).std())
+
+    system = double_integrator(process_noise=0.03)
+    np.testing.assert_allclose(residual(None), 0.03, rtol=0.05)
+    np.testing.assert_allclose(residual(0.2), 0.2, rtol=0.05)
+    assert residual(0.0) < 1e-10
+
+
+def test_the_same_seed_gives_the_same_recording(system):
+    one, two, other = (GaussianExcitation(length=9, seed=seed).record(system) for seed in (3, 3, 4))
+    assert np.array_equal(one.states, two.states)
+    assert np.array_equal(one.inputs, two.inputs)
+    assert not np.array_equal(one.inputs, other.inputs)
+
+
+def test_recordings_of_a_fleet_have_a_robot_dimension():
+    recording = GaussianExcitation(length=20, process_noise=0.0, count=2).record(fleet())
+    assert recording.states.shape == (3, 2, 21, 3)
+    for k, robot in enumerate(members(fleet())):
+        rolled = robot.simulate(recording.states[k, :, 0], recording.inputs[k])
+        np.testing.assert_allclose(rolled, recording.states[k], atol=1e-12)
+
+
+@pytest.mark.parametrize("states", [(2, 10, 4), (2, 11, 4, 1), (11, 4), (3, 11, 4)])
+def test_a_recording_has_one_state_more_than_inputs(states):
+    with pytest.raises(ShapeError, match=r"recording: states .* expected \(\.\.\., count, S\+1, n\)"):
+        Recording(np.zeros(states), np.zeros((2, 10, 2)))
+
+
+def test_least_squares_finds_A_and_B(system):
+    recording = GaussianExcitation(length=60, process_noise=0.0, count=2).record(system)
+    A, B = identify(recording)
+    atol = tolerance(size=60, conditioning=1e3)
+    np.testing.assert_allclose(A, system.A, atol=atol)
+    np.testing.assert_allclose(B, system.B, atol=atol)
+
+
+def test_least_squares_comes_closer_with_length():
+    system = double_integrator(process_noise=0.05)
+    errors = [np.abs(identify(GaussianExcitation(length=S).record(system))[0] - system.A).max() for S in (30, 3000)]
+    assert errors[1] < errors[0] / 3
+
+
+def test_recordings_under_feedback_cannot_identify(system):
+    x = GaussianExcitation(length=60, process_noise=0.01).record(system).states
+    gain = np.ones((system.input_dim, system.state_dim))
+    with pytest.raises(ExcitationError, match=rf"span {system.state_dim} dimensions, n \+ m = "):
+        identify(Recording(x, x[:, :-1] @ gain.T))
