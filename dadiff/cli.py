@@ -34,17 +34,12 @@ def one_run(config: dict[str, Any]) -> None:
         return
     parts["tracking"].prepare()
 
-    from dadiff.experiment import execute
+    from dadiff.launching.jobs import run
     from dadiff.summary import summary
 
-    run = execute(config)
-    parts["tracking"].log_run(run)
-    if run.record["links"].get("denoiser"):
-        from dadiff.store import Cache
-
-        parts["tracking"].log_training(Cache(parts.settings.output_dir).folder("denoiser", identity.denoiser.key))
-    print(summary([run]))
-    print(f"stored in {run.folder}")
+    stored = run(config)
+    print(summary([stored]))
+    print(f"stored in {stored.folder}")
 
 
 @hydra.main(version_base="1.3", config_path=str(shipped("conf").absolute()), config_name="config")

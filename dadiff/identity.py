@@ -127,10 +127,12 @@ def _axes(choices: Mapping[str, str], nodes: Mapping[str, Mapping[str, Any]], pa
 
 
 def _name(choices: Mapping[str, str], nodes: Mapping[str, Mapping[str, Any]], parts: Parts) -> str:
-    fixed = getattr(parts["projector"], "initial_state", "free") == "fixed"
+    fixed = nodes["projector"].get("initial_state") == "fixed"
     words = [_word("task", choices, nodes), _word("projector", choices, nodes) + ("_fixed" if fixed else "")]
     if "recording" in choices and "length" in nodes["recording"]:
-        words += [f"S={nodes['recording']['length']}", f"w={nodes['recording']['process_noise']}"]
+        recording = nodes["recording"]
+        words += [f"S={recording['length']}", f"w={recording['process_noise']}"]
+        words += [f"recording={recording['seed']}"] if recording["seed"] != parts.settings.seed else []
     words += [_word(group, choices, nodes) for group in ("enforcement", "denoiser", "sampler") if group in choices]
     return "/".join([*words, f"seed={parts.settings.seed}"])
 

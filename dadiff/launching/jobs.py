@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import platform
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 from dadiff.config import build
 from dadiff.errors import DadiffError
 from dadiff.identity import identify
 from dadiff.launching.outcome import why
-from dadiff.store import Cache, Results, StoredRun
+from dadiff.store import DONE, Cache, Results, StoredRun
 from dadiff.tracking import Tracking
 
 if TYPE_CHECKING:
@@ -37,10 +39,24 @@ def run(config: Mapping[str, Any]) -> StoredRun:
         stored, run_id = execute(config), None
     else:
         run_id = tracking.start(identity.key, identity.name, config["output_dir"])
-        with _closing(tracking, run_id):
+        with _closing(tracking, run_id, config):
             stored = execute(config)
     tracking.log_run(stored, run_id)
     return stored
+
+
+def record_end(config: Mapping[str, Any], status: str, reason: str) -> None:
+    """Store how a run ended that gave no result of its own, unless a result with its key is already there."""
+    identity = identify(config)
+    record = {
+        "key": identity.key,
+        "name": identity.name,
+        "axes": identity.axes,
+        "config": dict(config),
+        "links": {},
+        "provenance": {"host": platform.node(), "ended": datetime.now(UTC).isoformat(timespec="seconds")},
+    }
+    Results(config["output_dir"]).write_failure(record, status, reason)
 
 
 def train(config: Mapping[str, Any]) -> None:
@@ -57,11 +73,18 @@ def train(config: Mapping[str, Any]) -> None:
     tracking.log_training(cache.folder("denoiser", artefact.key), run_id)
 
 
-def build_dataset(config: Mapping[str, Any]) -> None:
-    """Build the data set, unless it is cached."""
+def build_demonstrations(config: Mapping[str, Any]) -> None:
+    """Build the demonstrations, unless they are cached."""
     from dadiff.assembly import Experiment
 
-    _ = Experiment.of(config).data
+    _ = Experiment.of(config).demonstrations
+
+
+def build_cases(config: Mapping[str, Any]) -> None:
+    """Build the test cases, unless they are cached."""
+    from dadiff.assembly import Experiment
+
+    _ = Experiment.of(config).cases
 
 
 def _denoiser(config: Mapping[str, Any]) -> Artefact:
@@ -72,10 +95,19 @@ def _denoiser(config: Mapping[str, Any]) -> Artefact:
 
 
 @contextmanager
-def _closing(tracking: Tracking, run_id: str | None) -> Iterator[None]:
-    """Close the MLflow run if the work raises; if its process is killed, the next start closes it."""
+def _closing(tracking: Tracking, run_id: str | None, config: Mapping[str, Any] | None = None) -> Iterator[None]:
+    """Close the MLflow run if the work raises; if its process is killed, the next start closes it.
+
+    Args:
+        config: of a run, which is stored where its failure is itself a result.
+    """
     try:
         yield
     except BaseException as error:
-        tracking.stop(run_id, *why(error))
+        status, reason = why(error)
+        if config is not None and status in DONE:
+            record_end(config, status, reason)
+            tracking.log_run(Results(config["output_dir"]).read(identify(config).key), run_id)
+        else:
+            tracking.stop(run_id, status, reason)
         raise

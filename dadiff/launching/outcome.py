@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from dadiff.errors import DadiffError
+from dadiff.errors import DadiffError, ExcitationError, InfeasibleError
 
 
 @dataclass(frozen=True)
@@ -12,7 +12,7 @@ class Outcome:
     """The end of a job.
 
     Args:
-        status: "finished", "failed", "killed", "timeout" or "out_of_memory".
+        status: "finished", "refused", "infeasible", "failed", "killed", "timeout" or "out_of_memory".
     """
 
     status: str
@@ -25,6 +25,10 @@ def why(error: BaseException) -> tuple[str, str]:
     reason = " ".join(str(error).split())
     if isinstance(error, KeyboardInterrupt):
         return "interrupted", "interrupted"
+    if isinstance(error, ExcitationError):
+        return "refused", reason
+    if isinstance(error, InfeasibleError):
+        return "infeasible", reason
     out_of_memory = isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError"
     if out_of_memory or "can't allocate memory" in reason:
         return "out_of_memory", f"out of memory: {reason or type(error).__name__}"

@@ -138,6 +138,7 @@ class RolloutProjector:
     """Keeps the planned inputs and recomputes the states from x_init with known (A, B)."""
 
     needs: ClassVar[str | None] = "system"
+    initial_state: ClassVar[InitialState] = "fixed"
 
     def fit(self, layout: Layout, system: LinearSystem | None = None, recording: Recording | None = None) -> Rollout:
         """The map u -> F [x_init; u]."""

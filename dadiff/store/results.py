@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     import numpy as np
     import pandas as pd
 
-DONE = ("finished", "diverged", "infeasible")
-"""Statuses that are results; a run with any other one is done again."""
+DONE = ("finished", "diverged", "infeasible", "refused")
+"""Statuses that are results (`refused`: the recording does not determine the dynamics); any other is done again."""
 
 RECORD = "run.json"
 
