@@ -10,7 +10,7 @@ import numpy as np
 import yaml
 
 from dadiff.config import build
-from dadiff.config.build import TARGET, resolve
+from dadiff.config.build import resolve
 from dadiff.systems import GaussianExcitation, LinearSystem, double_integrator
 
 CONF = Path(__file__).parent.parent / "conf"
@@ -59,23 +59,28 @@ def presets(group: str) -> list[str]:
     return sorted(file.stem for file in (CONF / group).glob("*.yaml"))
 
 
+def node(group: str, preset: str) -> dict[str, Any]:
+    """A preset as written, over the presets of its own group that it starts from."""
+    content = yaml.safe_load((CONF / group / f"{preset}.yaml").read_text())
+    parents = [name for name in content.pop("defaults", []) if name != "_self_"]
+    return {key: value for name in parents for key, value in node(group, name).items()} | content
+
+
 def component(group: str, preset: str, **overrides: Any) -> Any:
-    """The component of a preset that stands for itself: no interpolation, no defaults list."""
-    node = yaml.safe_load((CONF / group / f"{preset}.yaml").read_text())
-    return build({**node, **overrides}, group)
+    """The component of a preset that refers to no other group."""
+    return build({**node(group, preset), **overrides}, group)
 
 
 def variants(group: str, options: dict[str, tuple[Any, ...]]) -> dict[str, Any]:
-    """Every preset of a group, as it is and with each of the given values of the parameters that it has."""
-    found = {}
+    """Every preset of a group, and each with the given values of the parameters that it has; equal ones once."""
+    found: dict[str, Any] = {}
     for preset in presets(group):
-        node = yaml.safe_load((CONF / group / f"{preset}.yaml").read_text())
-        found[preset] = component(group, preset)
-        parameters = inspect.signature(resolve({TARGET: node[TARGET]}, group)).parameters
-        for name, values in options.items():
-            if name in parameters:
-                changed = {f"{preset},{name}={value}": component(group, preset, **{name: value}) for value in values}
-                found |= {key: value for key, value in changed.items() if value != found[preset]}
+        parameters = inspect.signature(resolve(node(group, preset), group)).parameters
+        changes = [{name: value} for name, values in options.items() if name in parameters for value in values]
+        for change in ({}, *changes):
+            made = component(group, preset, **change)
+            if made not in found.values():
+                found[",".join([preset, *(f"{name}={value}" for name, value in change.items())])] = made
     return found
 
 

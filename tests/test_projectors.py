@@ -23,7 +23,7 @@ PROJECTORS = {
     if not isinstance(projector, NoProjector)
 }
 ORTHOGONAL = {name: p for name, p in PROJECTORS.items() if not isinstance(p, RolloutProjector)}
-HOLDING = {n: p for n, p in PROJECTORS.items() if n.endswith("fixed") or isinstance(p, RolloutProjector)}
+HOLDING = {name: p for name, p in PROJECTORS.items() if p.initial_state == "fixed"}
 # What learning (A, B) or the set from a recording magnifies the rounding of its entries by.
 CONDITIONING = 1e3
 

@@ -1,0 +1,283 @@
+"""Laws of data sets: generated ones repeat, files are read and never executed, complaints name the place."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dadiff.datasets import Generated, NpzRecordings, NpzTrajectories
+from dadiff.datasets.cached import load_data, save_data
+from dadiff.datasets.files import read_array
+from dadiff.errors import ConfigError, DataError
+from dadiff.projectors import Hankel, Known
+from dadiff.systems import GaussianExcitation, LinearSystem, double_integrator
+from dadiff.tasks import LQR, Demonstrations
+from dadiff.trajectory.subspace import largest_angle
+
+SYSTEM, TASK = double_integrator(), LQR(horizon=6)
+
+
+def write(folder: Path, name: str, **changes) -> Path:
+    """One trajectory as stored by someone else; a change of None leaves the array out."""
+    rng = np.random.default_rng(len(name))
+    made = TASK.demonstrations(SYSTEM, 1, rng)
+    states, inputs = SYSTEM.layout(TASK.horizon).split(made.trajectories[0])
+    ends = np.split(made.environment[0], 2)
+    arrays = {"states": states, "inputs": inputs, "initial_state": ends[0], "target_state": ends[1], **changes}
+    folder.mkdir(parents=True, exist_ok=True)
+    np.savez(folder / name, **{key: value for key, value in arrays.items() if value is not None})
+    return folder / name
+
+
+@pytest.fixture
+def folder(tmp_path) -> Path:
+    """A folder with three trajectories to train on and two to test on."""
+    for name in ("a.npz", "bb.npz", "ccc.npz"):
+        write(tmp_path / "train", name)
+    for name in ("dddd.npz", "eeeee.npz"):
+        write(tmp_path / "test", name)
+    return tmp_path
+
+
+# --- generated
+
+
+def test_sizes_are_as_asked_and_the_same_seed_gives_the_same_data():
+    one, two, other = (Generated(50, 7, seed) for seed in (1, 1, 2))
+    train, test = one.train(TASK, SYSTEM), one.test(TASK, SYSTEM)
+    assert train.trajectories.shape == (50, SYSTEM.layout(6).size)
+    assert test.reference.shape == (7, SYSTEM.layout(6).size)
+    assert np.array_equal(train.trajectories, two.train(TASK, SYSTEM).trajectories)
+    assert np.array_equal(test.reference, two.test(TASK, SYSTEM).reference)
+    assert not np.array_equal(test.reference, other.test(TASK, SYSTEM).reference)
+
+
+def test_the_test_cases_do_not_move_with_the_training_size():
+    small, large = (Generated(size, 5).test(TASK, SYSTEM).environment for size in (10, 1000))
+    assert np.array_equal(small, large)
+
+
+def test_no_test_case_is_a_training_environment():
+    data = Generated(100, 100)
+    train, test = data.train(TASK, SYSTEM).environment, data.test(TASK, SYSTEM).environment
+    assert not (train[:, None] == test[None]).all(-1).any()
+
+
+@pytest.mark.parametrize("sizes", [(0, 10), (10, 0), (-1, 10)])
+def test_sizes_out_of_range_are_refused_in_one_line(sizes):
+    with pytest.raises(ConfigError, match=r"^dataset: [^\n]*$"):
+        Generated(*sizes)
+
+
+def test_what_is_cached_is_what_was_made(tmp_path):
+    train = replace(Generated(20, 5).train(TASK, SYSTEM), notes={"share": 0.5})
+    save_data(tmp_path, lambda: train)
+    again = Demonstrations(**load_data(tmp_path))
+    assert np.array_equal(again.trajectories, train.trajectories)
+    assert np.array_equal(again.environment, train.environment)
+    assert again.notes == {"share": 0.5}
+
+
+# --- trajectories from files
+
+
+def test_files_become_demonstrations_and_cases_with_their_own_references(folder):
+    data = NpzTrajectories(str(folder))
+    train, test = data.train(TASK, SYSTEM), data.test(TASK, SYSTEM)
+    assert train.trajectories.shape == (3, SYSTEM.layout(6).size)
+    with np.load(folder / "test" / "dddd.npz") as stored:
+        states, inputs = SYSTEM.layout(6).split(test.reference[0])
+        assert np.array_equal(states, stored["states"])
+        assert np.array_equal(inputs, stored["inputs"])
+        assert np.array_equal(test.x_init[0], stored["initial_state"])
+        assert np.array_equal(test.environment[0, 4:], stored["target_state"])
+
+
+def test_controls_is_another_name_for_inputs_and_other_arrays_are_ignored(folder):
+    plain = NpzTrajectories(str(folder)).train(TASK, SYSTEM).trajectories
+    with np.load(folder / "train" / "a.npz") as stored:
+        arrays = dict(stored)
+    arrays["controls"] = arrays.pop("inputs")
+    np.savez(folder / "train" / "a.npz", **arrays, cost=np.array([{"any": "thing"}], dtype=object))
+    assert np.array_equal(NpzTrajectories(str(folder)).train(TASK, SYSTEM).trajectories, plain)
+
+
+def test_sizes_take_the_first_files_by_name(folder):
+    data = NpzTrajectories(str(folder), train_size=2, test_size=1)
+    assert len(data.train(TASK, SYSTEM).trajectories) == 2
+    assert len(data.test(TASK, SYSTEM).reference) == 1
+
+
+def test_the_fingerprint_follows_the_content_and_not_the_place(folder, tmp_path_factory):
+    copy = tmp_path_factory.mktemp("copy")
+    for file in folder.rglob("*.npz"):
+        (copy / file.relative_to(folder)).parent.mkdir(exist_ok=True)
+        (copy / file.relative_to(folder)).write_bytes(file.read_bytes())
+    data, moved = NpzTrajectories(str(folder)), NpzTrajectories(str(copy))
+    for part in ("train", "test"):
+        assert moved.determined_by(part) == data.determined_by(part)
+    write(copy / "train", "a.npz", states=np.zeros((7, 4)))
+    assert moved.determined_by("train") != data.determined_by("train")
+    assert moved.determined_by("test") == data.determined_by("test")
+
+
+class Bomb:
+    """Leaves a trace where it is unpickled."""
+
+    def __init__(self, trace: Path) -> None:
+        self.trace = trace
+
+    def __reduce__(self):
+        return Path.touch, (self.trace,)
+
+
+BAD = {
+    "missing": ({"states": None}, "has no array states; found inputs, initial_state, target_state"),
+    "no inputs": ({"inputs": None}, "has no array inputs or controls; found"),
+    "nan": ({"states": np.full((7, 4), np.nan)}, "array states holds a value that is not finite"),
+    "infinite": ({"target_state": np.full(4, np.inf)}, "array target_state holds a value that is not finite"),
+    "horizon": ({"states": np.zeros((9, 4))}, r"array states has shape (9, 4); expected (7, 4)"),
+    "state_dim": ({"states": np.zeros((7, 3))}, r"array states has shape (7, 3); expected (7, 4)"),
+    "input_dim": ({"inputs": np.zeros((6, 1))}, r"array inputs or controls has shape (6, 1); expected (6, 2)"),
+    "dimensions": ({"initial_state": np.zeros((1, 4))}, r"array initial_state has shape (1, 4); expected (4)"),
+    "text": ({"states": np.array([["a"] * 4] * 7)}, "array states holds <U1; expected real numbers"),
+    "complex": ({"states": np.zeros((7, 4), complex)}, "array states holds complex128; expected real numbers"),
+    "times": ({"states": np.zeros((7, 4), "datetime64[s]")}, "array states holds datetime64[s]; expected real numbers"),
+}
+
+
+@pytest.mark.parametrize(("changes", "message"), BAD.values(), ids=BAD.keys())
+def test_a_bad_array_is_named_with_its_file(folder, changes, message):
+    file = write(folder / "train", "bb.npz", **changes)
+    with pytest.raises(DataError, match="^" + re.escape(f"{file}: {message}")):
+        NpzTrajectories(str(folder)).train(TASK, SYSTEM)
+
+
+def test_pickled_objects_are_refused_and_never_loaded(folder, tmp_path):
+    trace = tmp_path / "executed"
+    file = write(folder / "train", "bb.npz", states=np.array([Bomb(trace)], dtype=object))
+    with pytest.raises(DataError, match=re.escape(f"{file}: array states cannot be read (Object arrays")):
+        NpzTrajectories(str(folder)).train(TASK, SYSTEM)
+    assert not trace.exists()
+
+
+def damaged(content: bytes) -> dict[str, bytes]:
+    return {
+        "empty": b"",
+        "text": b"not an archive",
+        "cut": content[:-40],
+        "overwritten": content[:150] + bytes(200) + content[350:],
+        "header": content.replace(b"{'descr'", b"{'desrc'", 1),
+    }
+
+
+@pytest.mark.parametrize("kind", damaged(b""))
+def test_a_damaged_file_is_named(folder, kind):
+    file = folder / "train" / "bb.npz"
+    with np.load(file) as stored:
+        arrays = dict(stored)
+    np.savez_compressed(file, **arrays) if kind == "overwritten" else None
+    file.write_bytes(damaged(file.read_bytes())[kind])
+    with pytest.raises(
+        DataError, match=f"^{re.escape(str(file))}: (is not a readable|array states cannot be read|has no)"
+    ):
+        NpzTrajectories(str(folder)).train(TASK, SYSTEM)
+
+
+def test_every_truncation_of_a_file_is_refused(folder):
+    file = folder / "train" / "a.npz"
+    whole = file.read_bytes()
+    for length in range(0, len(whole), 61):
+        file.write_bytes(whole[:length])
+        with pytest.raises(DataError, match=re.escape(str(file))):
+            read_array(file, ["states"], (7, 4))
+
+
+def test_an_array_that_is_not_in_an_archive_is_refused(tmp_path):
+    with (tmp_path / "a.npz").open("wb") as stream:
+        np.save(stream, np.zeros(3))
+    with pytest.raises(DataError, match=r"a\.npz: is not a readable \.npz file; write it with numpy\.savez"):
+        read_array(tmp_path / "a.npz", ["states"], (3,))
+
+
+@pytest.mark.parametrize("part", ["train", "test"])
+def test_empty_and_missing_folders_are_named(folder, part):
+    data = NpzTrajectories(str(folder))
+    for file in (folder / part).iterdir():
+        file.unlink()
+    with pytest.raises(DataError, match=rf"{part}: holds no \.npz file"):
+        data.determined_by(part)
+    (folder / part).rmdir()
+    with pytest.raises(DataError, match=f"{part}: there is no such folder"):
+        data.determined_by(part)
+
+
+def test_a_task_with_another_condition_needs_another_data_set(folder):
+    class Elsewhere(LQR):
+        def environment_dim(self, system):
+            return 30
+
+    with pytest.raises(ConfigError, match=r"E = \[x_init; x_target\] with 8 entries, but the task's E has 30"):
+        NpzTrajectories(str(folder)).train(Elsewhere(horizon=6), SYSTEM)
+
+
+# --- recordings from files
+
+
+def record(folder: Path, name: str, system: LinearSystem = SYSTEM, length: int = 60, seed: int = 0, **changes) -> Path:
+    made = GaussianExcitation(length, process_noise=0.0, seed=seed).record(system)
+    folder.mkdir(exist_ok=True)
+    np.savez(folder / name, **{"states": made.states[0], "controls": made.inputs[0], **changes})
+    return folder / name
+
+
+def test_own_recordings_teach_the_dynamics(tmp_path, system):
+    for seed in range(3):
+        record(tmp_path, f"{seed}.npz", system, seed=seed)
+    recording = NpzRecordings(str(tmp_path)).record(system)
+    assert (recording.count, recording.length) == (3, 60)
+    layout = system.layout(6)
+    learned, known = Hankel().fit(layout, recording=recording), Known().fit(layout, system)
+    assert largest_angle(learned.basis, known.basis) < 1e-10
+
+
+def test_recordings_of_other_lengths_are_named(tmp_path):
+    record(tmp_path, "a.npz", length=60)
+    file = record(tmp_path, "b.npz", length=50)
+    with pytest.raises(DataError, match=re.escape(f"{file}: has S = 50 inputs, a.npz has 60; cut to equal S")):
+        NpzRecordings(str(tmp_path)).record(SYSTEM)
+
+
+def test_recordings_of_another_system_are_named(tmp_path):
+    file = record(tmp_path, "a.npz", double_integrator(axes=1))
+    with pytest.raises(
+        DataError, match=re.escape(f"{file}: array inputs or controls has shape (60, 1); expected (any, 2)")
+    ):
+        NpzRecordings(str(tmp_path)).record(SYSTEM)
+
+
+def test_a_recording_needs_one_state_more_than_inputs(tmp_path):
+    file = record(tmp_path, "a.npz", states=np.zeros((60, 4)))
+    with pytest.raises(DataError, match=re.escape(f"{file}: array states has shape (60, 4); expected (61, 4)")):
+        NpzRecordings(str(tmp_path)).record(SYSTEM)
+
+
+def test_a_fleet_has_a_folder_a_robot(tmp_path):
+    robots = LinearSystem(np.stack([SYSTEM.A] * 2), np.stack([SYSTEM.B] * 2))
+    record(tmp_path / "robot_0", "a.npz")
+    with pytest.raises(DataError, match="no recordings for robot_1; expected one folder for each of 2 robots"):
+        NpzRecordings(str(tmp_path)).record(robots)
+    record(tmp_path / "robot_1", "a.npz", length=50)
+    with pytest.raises(DataError, match="robot_1: holds 1 recordings with S = 50, robot_0 1 with 60"):
+        NpzRecordings(str(tmp_path)).record(robots)
+    record(tmp_path / "robot_1", "a.npz", seed=1)
+    assert NpzRecordings(str(tmp_path)).record(robots).inputs.shape == (2, 1, 60, 2)
+
+
+def test_a_missing_folder_of_recordings_is_named(tmp_path):
+    with pytest.raises(DataError, match="nowhere: there is no such folder"):
+        NpzRecordings(str(tmp_path / "nowhere")).fingerprint()
