@@ -40,7 +40,7 @@ def _upload(output_dir: Path, run: StoredRun, uri: str | None) -> None:
     if is_tracked(run.folder, tracking.uri):
         return
     tracking.prepare()
-    denoiser = run.record["links"].get("denoiser")
+    denoiser = run.record.get("links", {}).get("denoiser")
     if denoiser and Cache(output_dir).contains("denoiser", denoiser):
         tracking.log_training(Cache(output_dir).folder("denoiser", denoiser))
     tracking.log_run(run)

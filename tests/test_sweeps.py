@@ -30,7 +30,8 @@ CELLS = [
     ["projector=known"],
     ["projector=none", "enforcement=normalised"],
     ["projector=none", "enforcement=convex"],  # the same run: nothing is projected
-    ["projector=hankel", "recording.length=20"],  # too short
+    ["projector=known", "projector.initial_state=fixed", "enforcement=literal"],  # meaningless together
+    ["projector=hankel", "recording.length=20"],  # too short: refused, which is a result
 ]
 
 
@@ -74,29 +75,29 @@ def first(root):
 
 def test_a_plan_has_each_key_once_and_builds_what_is_shared_first(tmp_path):
     plan = make_plan(configs(tmp_path))
-    assert [cell.copies for cell in plan.cells] == [1, 2, 1]
-    assert [p.artefact.kind for p in plan.preparations] == ["demonstrations", "denoiser"]
-    dataset, denoiser = (p.artefact.key for p in plan.preparations)
-    assert plan.preparations[1].needs == {dataset}
-    assert plan.needs(plan.cells[0]) == {dataset, denoiser}
+    assert [cell.copies for cell in plan.cells] == [1, 2, 1, 1]
+    assert [p.artefact.kind for p in plan.preparations] == ["demonstrations", "denoiser", "cases"]
+    demonstrations, denoiser, cases = (p.artefact.key for p in plan.preparations)
+    assert plan.preparations[1].needs == {demonstrations}
+    assert plan.needs(plan.cells[0]) == {demonstrations, denoiser, cases}
     text = describe(plan)
-    assert "3 cells, 0 done, 3 to run" in text
+    assert "4 cells, 0 done, 4 to run" in text
     assert "(2 cells of the sweep)" in text
-    assert f"denoiser {denoiser} is shared by 3 cells" in text
+    assert f"denoiser {denoiser} is shared by 4 cells" in text
     assert f"would train denoiser {denoiser}" in text
 
 
 def test_what_succeeds_is_stored_and_what_fails_is_recorded_with_its_reason(first, root):
     run, outcomes = first
     sweep = Sweeps(root).read("quick")
-    assert [cell.status for cell in sweep.cells] == ["finished", "finished", "failed"]
-    assert "S" in sweep.cells[2].reason
+    assert [cell.status for cell in sweep.cells] == ["finished", "finished", "failed", "refused"]
+    assert "literal scales the sample" in sweep.cells[2].reason
     failed = Results(root).read(sweep.cells[2].key)
     assert (failed.status, failed.record["reason"]) == ("failed", sweep.cells[2].reason)
     assert [entry.kind for entry in Cache(root).entries()] == ["cases", "demonstrations", "denoiser"]
-    assert len(outcomes) == 5
+    assert len(outcomes) == 7
     text = summary(sweep, 0, run.folder)
-    assert "2 finished, 1 failed" in text
+    assert "2 finished, 1 failed, 1 refused" in text
     assert "dadiff +sweeps=quick" in text
 
 
@@ -105,19 +106,19 @@ def test_mlflow_shows_the_sweep_its_runs_and_the_training(first, root):
     client, experiment = open_client(run.tracking.uri), run.tracking._experiment_id
     mirrors = {r.info.run_name: r for r in client.search_runs([experiment])}
     kinds = sorted(mirror.data.tags["kind"] for mirror in mirrors.values())
-    assert kinds == ["run", "run", "run", "sweep", "training"]
+    assert kinds == ["run", "run", "run", "run", "sweep", "training"]
     assert {mirror.info.status for mirror in mirrors.values()} == {"FINISHED", "FAILED"}
     parent = mirrors["quick"].info.run_id
     children = [m for m in mirrors.values() if m.data.tags["kind"] == "run"]
     assert {child.data.tags["mlflow.parentRunId"] for child in children} == {parent}
     training = next(m for m in mirrors.values() if m.data.tags["kind"] == "training")
-    finished = [child for child in children if child.info.status == "FINISHED"]
+    finished = [child for child in children if child.data.tags["status"] == "finished"]
     assert {child.data.tags["link.denoiser"] for child in finished} == {training.data.tags["key"]}
 
 
 def test_a_rerun_does_only_what_failed(first, root):
     run = SweepRun.of(make_plan(configs(root)), "quick", "dadiff", {})
-    assert [cell.identity.name.split("/")[1] for cell in run.plan.waiting] == ["hankel"]
+    assert [cell.identity.name.split("/")[1] for cell in run.plan.waiting] == ["known_fixed"]
     assert run.plan.preparations == []
     assert len(run.works(None)) == 1
     assert not run.is_over()
@@ -135,7 +136,7 @@ def test_a_sweep_whose_cells_are_done_is_over(first, root):
 
 def test_sync_uploads_to_another_store_what_is_missing(first, root, tmp_path):
     uri = f"sqlite:///{tmp_path}/other.db"
-    assert sync(root, uri) == (2, 0)
+    assert sync(root, uri) == (3, 0)
     assert sync(root, uri) == (0, 0)
     assert all(is_tracked(run.folder, uri) for run in Results(root) if run.status == "finished")
 

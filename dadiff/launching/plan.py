@@ -13,6 +13,8 @@ from typing import Any
 from dadiff.identity import Artefact, Identity, identify
 from dadiff.store import Cache, Cell, Results
 
+KINDS = ("demonstrations", "denoiser", "cases")
+
 
 @dataclass(frozen=True)
 class PlannedCell:
@@ -94,19 +96,24 @@ def _planned(config: dict[str, Any], identity: Identity, copies: int) -> Planned
 
 
 def _preparations(cells: Sequence[PlannedCell]) -> list[Preparation]:
-    """Data sets before trainings; each once, with the configuration of the first cell that needs it."""
+    """What trainings need, trainings, test cases; each once, with the configuration of the first cell that needs it."""
     found: dict[str, Preparation] = {}
-    for kind in ("demonstrations", "denoiser"):
+    for position in range(len(KINDS)):
         for cell in cells:
-            artefact = getattr(cell.identity, kind)
-            if artefact and not Cache(cell.config["output_dir"]).contains(kind, artefact.key):
-                before = frozenset(found) & {cell.identity.demonstrations.key} - {artefact.key}
-                found.setdefault(artefact.key, Preparation(artefact, cell.config, before))
+            artefact = _artefacts(cell.identity)[position]
+            if artefact and not Cache(cell.config["output_dir"]).contains(artefact.kind, artefact.key):
+                before = {cell.identity.demonstrations.key} if artefact.kind == "denoiser" else set()
+                found.setdefault(artefact.key, Preparation(artefact, cell.config, frozenset(found) & before))
     return list(found.values())
 
 
+def _artefacts(identity: Identity) -> tuple[Artefact | None, ...]:
+    """In the order of `KINDS`; an exact denoiser needs no demonstrations."""
+    return (identity.demonstrations if identity.denoiser else None, identity.denoiser, identity.cases)
+
+
 def _keys(identity: Identity) -> set[str]:
-    return {artefact.key for artefact in (identity.demonstrations, identity.denoiser) if artefact}
+    return {artefact.key for artefact in _artefacts(identity) if artefact}
 
 
 def describe(plan: Plan) -> str:

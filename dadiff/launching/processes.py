@@ -84,7 +84,7 @@ class ProcessesLauncher(Launcher):
             interrupted = True
         watch.table.close()
         sweep = run.close(parent, watch.outcomes, interrupted=interrupted)
-        sys.stderr.write(summary(sweep, skipped, run.folder) + "\n")
+        sys.stderr.write(f"{summary(sweep, skipped, run.folder)}\n{run.tracking.how_to_look(run.name)}\n")
         return 130 if interrupted else int(any(cell.status not in DONE for cell in sweep.cells))
 
 

@@ -5,11 +5,9 @@ plan -> store and sweep.json -> MLflow's parent run -> jobs -> failures recorded
 
 from __future__ import annotations
 
-import platform
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +18,8 @@ from dadiff.launching.plan import Plan, PlannedCell, Preparation
 from dadiff.launching.pool import Work
 from dadiff.store import DONE, Cache, Cell, Results, Sweep, Sweeps
 from dadiff.tracking import Tracking, is_tracked
+
+BUILDERS = {"demonstrations": jobs.build_demonstrations, "denoiser": jobs.train, "cases": jobs.build_cases}
 
 
 @dataclass(frozen=True)
@@ -84,14 +84,7 @@ class SweepRun:
     def ended(self, cell: PlannedCell, outcome: Outcome) -> None:
         """Record a cell's failure on disk, beside the results of the others."""
         if outcome.status != "finished":
-            record = {
-                "key": cell.identity.key,
-                "name": cell.identity.name,
-                "axes": cell.identity.axes,
-                "config": cell.config,
-                "provenance": {"host": platform.node(), "ended": datetime.now(UTC).isoformat(timespec="seconds")},
-            }
-            Results(self.output_dir).write_failure(record, outcome.status, outcome.reason or outcome.status)
+            jobs.record_end(cell.config, outcome.status, outcome.reason or outcome.status)
 
     def close(self, parent: str | None, outcomes: Mapping[str, Outcome], *, interrupted: bool) -> Sweep:
         """Bring the sweep's record and MLflow up to date. Returns the record."""
@@ -138,7 +131,7 @@ class SweepRun:
 
     def _preparation(self, preparation: Preparation, parent: str | None) -> Work:
         artefact = preparation.artefact
-        function = jobs.train if artefact.kind == "denoiser" else jobs.build_dataset
+        function = BUILDERS[artefact.kind]
         log_file = self.folder / "logs" / f"{artefact.kind}-{artefact.key}.log"
         config = _with_parent(preparation.config, parent)
         return Work(artefact.key, preparation.name, function, (config,), log_file, preparation.needs)

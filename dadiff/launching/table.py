@@ -11,6 +11,7 @@ from typing import TextIO
 
 from dadiff.launching.outcome import Outcome
 from dadiff.launching.pool import Running, Work
+from dadiff.store import DONE
 
 REDRAW_SECONDS = 0.5
 SILENT_SECONDS = 60.0
@@ -34,7 +35,7 @@ class Table:
 
     def ended(self, work: Work, outcome: Outcome) -> None:
         """Say for good how a piece of work ended."""
-        self._ended["done" if outcome.status == "finished" else "failed"] += 1
+        self._ended["done" if outcome.status in DONE else "failed"] += 1
         self._clear()
         count = f"[{self._ended.total()}/{self._total}]"
         self._stream.write(f"{count:>9} {outcome.status:<9} {clock(outcome.seconds):>7}  {work.name}\n")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -14,6 +15,14 @@ from dadiff.store import Results, StoredRun, Sweep
 if TYPE_CHECKING:
     import pandas as pd
 
+HEADLINE = (
+    "rollout_state_error",
+    "planned_state_error",
+    "planned_input_error",
+    "cost_ratio",
+    "dynamics_residual",
+    "sampling_seconds",
+)
 INDICES = ("robot", "case", "sample", "t", "step")
 ALONG_TIME = "along_time/"
 ARTIFACTS = (".json", ".yaml", ".parquet", ".csv", ".png", ".svg", ".pdf")
@@ -25,13 +34,15 @@ class Content:
 
     Args:
         metrics: (name, value, step), finite values only.
-        time: of all metrics, in ms since 1970; taken from the record so that logging again changes nothing.
+        started, time: of the work and of all metrics, in ms since 1970; from the record, so that logging again
+            changes nothing; None and 0 where that is not recorded.
     """
 
     params: dict[str, str] = field(default_factory=dict)
     metrics: list[tuple[str, float, int]] = field(default_factory=list)
     tags: dict[str, str] = field(default_factory=dict)
     files: list[Path] = field(default_factory=list)
+    started: int | None = None
     time: int = 0
 
 
@@ -50,7 +61,7 @@ def run_content(run: StoredRun) -> Content:
     if provenance.get("commit"):
         tags["mlflow.source.git.commit"] = str(provenance["commit"])
     params = {name: _text(value) for name, value in run.axes.items()}
-    return Content(params, scalars(run) + curves(run), tags, artifacts(run.folder), end_time(provenance))
+    return Content(params, scalars(run) + curves(run), tags, artifacts(run.folder), *times(provenance))
 
 
 def scalars(run: StoredRun) -> list[tuple[str, float, int]]:
@@ -101,7 +112,7 @@ def training_content(manifest: dict[str, Any], folder: Path) -> Content:
     note = f"Training of the denoiser `{manifest['key']}`, shared by every run whose tag `link.denoiser` names it."
     tags = {"status": "finished", "mlflow.note.content": f"{note}\n\nThe weights lie in `{folder}`."}
     params = {name: _text(value) for name, value in identity.items()}
-    return Content(params, metrics, tags, artifacts(folder), end_time({"started": manifest.get("created")}))
+    return Content(params, metrics, tags, artifacts(folder), *times({"started": manifest.get("created")}))
 
 
 def sweep_content(sweep: Sweep, table_file: Path) -> Content:
@@ -118,6 +129,32 @@ def sweep_content(sweep: Sweep, table_file: Path) -> Content:
     tags = {"mlflow.note.content": "\n\n".join(note), "kind": "sweep"}
     metrics = [(name, value, 0) for name, value in counts.items()]
     return Content({name: _text(value) for name, value in sweep.definition.items()}, metrics, tags, [table_file])
+
+
+def sweep_view(sweep: Sweep, parent: str) -> str:
+    """State of MLflow's runs page that shows a sweep: its runs, with what varies and the headline metrics as columns.
+
+    MLflow keeps such states as tags of the experiment, and opens one with `?viewStateShareKey=` in the address.
+    """
+    columns = [f"params.`{name}`" for name in varying(sweep)] + [f"metrics.`{name}`" for name in HEADLINE]
+    return json.dumps(
+        {
+            "searchFilter": f"tags.`mlflow.parentRunId` = '{parent}'",
+            "orderByKey": f"metrics.`{HEADLINE[0]}`",
+            "orderByAsc": True,
+            "selectedColumns": columns,
+        }
+    )
+
+
+def varying(sweep: Sweep) -> list[str]:
+    """The axes that differ between cells; of several that always move together (the seeds) the first."""
+    values: dict[tuple[str, ...], str] = {}
+    for name in dict.fromkeys(name for cell in sweep.cells for name in cell.axes):
+        column = tuple(_text(cell.axes.get(name)) for cell in sweep.cells)
+        if len(set(column)) > 1:
+            values.setdefault(column, name)
+    return list(values.values())
 
 
 def results_table(sweep: Sweep, results: Results) -> pd.DataFrame:
@@ -144,12 +181,12 @@ def flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     return parts
 
 
-def end_time(provenance: dict[str, Any]) -> int:
-    """When the work ended, in ms since 1970; 0 where that is not recorded."""
+def times(provenance: dict[str, Any]) -> tuple[int | None, int]:
+    """When the work began and ended, in ms since 1970; None and 0 where that is not recorded."""
     if not provenance.get("started"):
-        return 0
+        return None, 0
     started = datetime.fromisoformat(provenance["started"]).timestamp()
-    return int(1000 * (started + float(provenance.get("seconds") or 0)))
+    return int(1000 * started), int(1000 * (started + float(provenance.get("seconds") or 0)))
 
 
 def chunks(items: Sequence[Any], size: int) -> list[Sequence[Any]]:

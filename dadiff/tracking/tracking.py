@@ -16,7 +16,15 @@ from dadiff.errors import ConfigError
 from dadiff.store import Results, StoredRun, Sweep, Sweeps
 from dadiff.store.files import locked, read_json
 from dadiff.tracking.client import SQLITE, open_client, prepare_store, process_start, spared
-from dadiff.tracking.content import Content, chunks, results_table, run_content, sweep_content, training_content
+from dadiff.tracking.content import (
+    Content,
+    chunks,
+    results_table,
+    run_content,
+    sweep_content,
+    sweep_view,
+    training_content,
+)
 from dadiff.tracking.markers import Marker, read_marker, write_marker
 
 if TYPE_CHECKING:
@@ -72,15 +80,23 @@ class Tracking:
         if self.enabled:
             _ = self._experiment_id
 
-    def start(self, key: str, name: str, output_dir: Path | str, kind: str = "run") -> str | None:
-        """Show in MLflow that work has begun. Returns the MLflow run's id; None if the store is away."""
+    def start(
+        self, key: str, name: str, output_dir: Path | str, kind: str = "run", started: int | None = None
+    ) -> str | None:
+        """Show in MLflow that work has begun. Returns the MLflow run's id; None if the store is away.
+
+        Args:
+            kind: "run", "training" or "sweep".
+            started: in ms since 1970, if not now.
+        """
         if not self.enabled:
             return None
         with spared(name):
             tags = {"key": key, "kind": kind, **_owner(output_dir)}
             if self.parent and kind == "run":
                 tags["mlflow.parentRunId"] = self.parent
-            return self._client.create_run(self._experiment_id, run_name=name, tags=tags).info.run_id
+            run = self._client.create_run(self._experiment_id, start_time=started, run_name=name, tags=tags)
+            return run.info.run_id
         return None
 
     def stop(self, run_id: str | None, status: str, reason: str) -> None:
@@ -136,9 +152,20 @@ class Tracking:
         results_table(sweep, Results(output_dir)).to_csv(table_file, index=False)
         with spared(sweep.name):
             self._log(run_id, sweep_content(sweep, table_file))
+            view = sweep_view(sweep, run_id)
+            self._client.set_experiment_tag(self._experiment_id, f"mlflow.sharedViewState.{sweep.name}", view)
             ended = "FINISHED" if status == "finished" else MLFLOW_STATUS.get(status, "FAILED")
             self._client.set_terminated(run_id, ended)
             write_marker(folder, self.uri, Marker(run_id, self._experiment_id, complete=status == "finished"))
+
+    def how_to_look(self, sweep_name: str) -> str:
+        """What a person types and opens to see a sweep in MLflow's pages, with its axes and metrics as columns."""
+        if not self.enabled:
+            return "tracking is off"
+        page = f"/#/experiments/{self._experiment_id}/runs?viewStateShareKey={sweep_name}"
+        if self.uri.startswith("http"):
+            return f"open {self.uri}{page}"
+        return f"mlflow ui --backend-store-uri {self.uri}   then open http://127.0.0.1:5000{page}"
 
     def attach(self, folder: Path, files: Iterable[Path], artifact_path: str) -> None:
         """Add files (a report) to the MLflow run that mirrors a folder, if there is one."""
@@ -180,7 +207,7 @@ class Tracking:
             if marker is not None and not self._is_gone(marker.run_id):
                 self._drop(run_id)
                 run_id = marker.run_id
-            run_id = run_id or self.start(key, name, output_dir, kind)
+            run_id = run_id or self.start(key, name, output_dir, kind, content.started)
             if run_id is None:
                 return
             write_marker(folder, self.uri, Marker(run_id, self._experiment_id, complete=False))
