@@ -186,7 +186,7 @@ def test_failed_and_missing_cells_decide_nothing_and_are_named(tmp_path):
     store.run(status="failed", reason="out of memory", projector="hankel", enforcement="normalised")
     verdict = judged(store, claim)
     assert verdict.verdict == "holds"
-    assert verdict.unavailable == ["Hankel HH†: failed: out of memory"]
+    assert verdict.unavailable == {"Hankel HH†": "failed: out of memory"}
 
 
 def test_a_comparison_without_its_baseline_is_not_made(tmp_path):
@@ -194,7 +194,7 @@ def test_a_comparison_without_its_baseline_is_not_made(tmp_path):
     store.run(0.2, projector="known", enforcement="normalised")
     verdict = judged(store, LEDGER["fig2_state"])
     assert verdict.verdict == "not tested here"
-    assert verdict.lines == ["no result: known FF†: no finished run of vanilla to compare with"]
+    assert verdict.lines == ["no result (no finished run of vanilla to compare with): known FF†"]
 
 
 @pytest.mark.parametrize(

@@ -75,13 +75,13 @@ class Finding:
 
 @dataclass(frozen=True)
 class Verdict:
-    """A claim with its findings."""
+    """A claim with its findings, and why methods without one have none."""
 
     claim: Claim
     verdict: str
     lines: list[str]
     findings: list[Finding]
-    unavailable: list[str]
+    unavailable: dict[str, str]
 
     @property
     def runs(self) -> list[str]:
@@ -113,10 +113,11 @@ def read_ledger(path: Path) -> list[Claim]:
 def judge(claim: Claim, evidence: Evidence) -> Verdict:
     """The verdict on one claim."""
     methods = evidence.methods(claim.cells)
-    findings, unavailable = [], []
+    findings: list[Finding] = []
+    unavailable: dict[str, str] = {}
     for measured in _measure(claim, evidence, methods):
         if measured.estimate is None and not measured.diverged:
-            unavailable.append(f"{measured.label}: {measured.text}")
+            unavailable[measured.label] = measured.text
         else:
             findings.append(_finding(claim, measured))
     return Verdict(claim, _verdict(findings), _lines(claim, findings, unavailable), findings, unavailable)
@@ -175,11 +176,13 @@ def _condition(findings: list[Finding]) -> str:
     return "; ".join(finding.label for finding in findings if finding.true)
 
 
-def _lines(claim: Claim, findings: list[Finding], unavailable: list[str]) -> list[str]:
+def _lines(claim: Claim, findings: list[Finding], unavailable: dict[str, str]) -> list[str]:
     """What was found, a line a method; generated from the numbers."""
     words = {True: "so", False: "not so", None: "open"}
     lines = [f"{words[finding.true]}: {finding.text}" for finding in findings]
-    lines += [f"no result: {text}" for text in unavailable]
+    for reason in dict.fromkeys(unavailable.values()):
+        labels = [label for label, text in unavailable.items() if text == reason]
+        lines.append(f"no result ({reason}): {'; '.join(labels)}")
     return lines or [f"no cell of this sweep has {_asked(claim.cells)}"]
 
 

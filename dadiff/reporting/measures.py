@@ -60,7 +60,8 @@ def _pairs(
     for method in _usable(methods, shown, out, metric):
         other = evidence.partner(method, against)
         if other is None or not has_metric(other.finished, metric):
-            text = f"no finished run of {method_name(dict(against))} to compare with"
+            wanted = ", ".join(axis_value(axis, value) for axis, value in against.items())
+            text = f"no finished run of {wanted} to compare with"
             out.append(Measured(method_name(method.axes, shown), method.axes, None, text, method.keys))
         else:
             yield method, other
@@ -115,7 +116,7 @@ def _along(band: Band) -> str:
     below, above, count = int((band.high < 0).sum()), int((band.low > 0).sum()), len(band.value)
     worst = int(band.high.argmax())
     at = _words(Estimate(float(band.value[worst]), float(band.low[worst]), float(band.high[worst])))
-    return f"lower at {below} and higher at {above} of {count} times at once, difference at t = {worst}: {at}"
+    return f"lower at {below} and higher at {above} of {count} times (one band for all), at t = {worst} by {at}"
 
 
 def dip(

@@ -8,20 +8,22 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import jinja2
 import numpy as np
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 from dadiff.errors import StoreError
 from dadiff.reporting import labels
 from dadiff.reporting.definitions import FOLDER
-from dadiff.reporting.figures.style import INK, Drawable
+from dadiff.reporting.figures.style import INK
 from dadiff.reporting.figures.style import render as render_figure
 from dadiff.reporting.latex import to_latex
 from dadiff.reporting.report import Part, Report
+from dadiff.reporting.statistics import Estimate
 from dadiff.reporting.tables import to_csv
 from dadiff.store.files import make_folder, strict
 
@@ -38,14 +40,36 @@ def render(report: Report, folder: Path) -> Path:
     """
     for part in ("tables", "figures"):
         make_folder(folder / part)
+    drawings = {part.item.id: _draw(part) for part in report.figures if not part.empty}
     try:
         _write_tables(report, folder / "tables")
-        _write_figures(report, folder / "figures")
+        for name, drawing in drawings.items():
+            for form, content in drawing.files.items():
+                (folder / "figures" / f"{name}.{form}").write_bytes(content)
         (folder / "report.json").write_text(json.dumps(numbers(report), indent=1, allow_nan=False) + "\n", "utf-8")
-        (folder / "index.html").write_text(to_html(report), "utf-8")
+        (folder / "index.html").write_text(to_html(report, drawings), "utf-8")
     except OSError as error:
         raise StoreError(f"{folder}: cannot be written ({error.strerror}); choose another --out") from None
     return folder / "index.html"
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """One figure as files, and as SVG for the inside of the page."""
+
+    files: dict[str, bytes]
+    inline: Markup
+
+
+def _draw(part: Part) -> Drawing:
+    files = render_figure(part.content, WIDE, ("pdf", "svg", "png"))
+    title, name = part.item.title, part.item.id
+    wide = Markup(inline_svg(files["svg"], title, name))
+    phone = render_figure(part.content, NARROW, ("svg",))["svg"]
+    if phone == files["svg"]:
+        return Drawing(files, Markup('<div class="drawing">{}</div>').format(wide))
+    both = Markup('<div class="drawing wide">{}</div><div class="drawing narrow">{}</div>')
+    return Drawing(files, both.format(wide, Markup(inline_svg(phone, title, f"{name}-phone"))))
 
 
 def _write_tables(report: Report, folder: Path) -> None:
@@ -54,12 +78,6 @@ def _write_tables(report: Report, folder: Path) -> None:
             (folder / f"{part.item.id}.csv").write_text(to_csv(part.content), "utf-8")
             text = to_latex(part.content, f"{part.item.title}. {part.facts}", part.item.id)
             (folder / f"{part.item.id}.tex").write_text(text, "utf-8")
-
-
-def _write_figures(report: Report, folder: Path) -> None:
-    for part in report.figures:
-        for form in () if part.empty else ("pdf", "svg", "png"):
-            (folder / f"{part.item.id}.{form}").write_bytes(render_figure(part.content, form, WIDE))
 
 
 def numbers(report: Report) -> dict[str, Any]:
@@ -95,7 +113,7 @@ def _plain(value: Any) -> Any:
     return value.tolist() if isinstance(value, np.ndarray) else value
 
 
-def to_html(report: Report) -> str:
+def to_html(report: Report, drawings: dict[str, Drawing]) -> str:
     """The page: one file that asks for nothing else. Whatever comes from a store is escaped."""
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(FOLDER / "templates"),
@@ -104,34 +122,24 @@ def to_html(report: Report) -> str:
         lstrip_blocks=True,
         undefined=jinja2.StrictUndefined,
     )
-    environment.filters |= {"number": labels.number, "metric": labels.metric_name, "estimate": _estimate}
-    environment.globals |= {"drawing": _drawing}
-    return environment.get_template("report.html").render(report=report, sweep=report.evidence.sweep)
+    environment.filters |= {"metric": labels.metric_name, "estimate": _estimate}
+    page = environment.get_template("report.html")
+    return page.render(report=report, sweep=report.evidence.sweep, drawings=drawings)
 
 
-def _estimate(estimate: Any) -> str:
-    return labels.with_interval(estimate.value, estimate.low, estimate.high) if estimate else "–"
+def _estimate(estimate: Estimate) -> str:
+    return labels.with_interval(estimate.value, estimate.low, estimate.high)
 
 
-def _drawing(part: Part) -> Markup:
-    """The figure as inline SVG, for wide pages and for phones; once if both are the same."""
-    wide, narrow = (inline_svg(part.content, part.item.title, f"{part.item.id}-{c}", c) for c in (WIDE, NARROW))
-    if wide.replace(f"{part.item.id}-{WIDE}", f"{part.item.id}-{NARROW}") == narrow:
-        return Markup('<div class="drawing">{}</div>').format(Markup(wide))
-    return Markup('<div class="drawing wide">{}</div><div class="drawing narrow">{}</div>').format(
-        Markup(wide), Markup(narrow)
-    )
-
-
-def inline_svg(plotted: Drawable, title: str, prefix: str, columns: int) -> str:
+def inline_svg(content: bytes, title: str, prefix: str) -> str:
     """SVG for the inside of a page: ids of its own, the page's text colour, as wide as its place at most."""
-    svg = render_figure(plotted, "svg", columns).decode()
-    svg = svg[svg.index("<svg") :]
-    svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
+    svg = content.decode()
+    svg = re.sub(r"<metadata>.*?</metadata>", "", svg[svg.index("<svg") :], flags=re.DOTALL)
     svg = re.sub(r'\bid="([^"]+)"', rf'id="{prefix}-\1"', svg)
     svg = re.sub(r'(href="#|url\(#)', rf"\1{prefix}-", svg)
-    svg = re.sub(INK, "currentColor", svg, flags=re.IGNORECASE)
-    label = str(Markup.escape(title))
-    width = float(re.search(r'width="([\d.]+)pt"', svg)[1]) * 4 / 3  # type: ignore[index]
-    size = rf'<svg role="img" aria-label="{label}" style="width:100%;max-width:{width:.0f}px;height:auto"'
-    return re.sub(r"<svg", lambda _: size, re.sub(r' (width|height)="[\d.]+pt"', "", svg, count=2), count=1)
+    svg = svg.replace(INK, "currentColor")
+    head, body = svg.split(">", 1)
+    width = float(head.partition('width="')[2].partition("pt")[0]) * 4 / 3
+    head = re.sub(r' (width|height)="[\d.]+pt"', "", head)
+    look = f'role="img" aria-label="{escape(title)}" style="width:100%;max-width:{width:.0f}px;height:auto"'
+    return f"{head} {look}>{body}"

@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from dadiff.reporting.aggregation import Evidence, Method, case_scalars, has_metric, pair, varying, weights_for
-from dadiff.reporting.figures.style import legend_below, letter, log_axis, look_of, panels
+from dadiff.reporting.figures.style import legend_below, letter, log_axis, look_of, looks_of, panels
 from dadiff.reporting.labels import axis_name, axis_value, method_name, metric_name
 from dadiff.reporting.selection import Selector
 from dadiff.reporting.statistics import Estimate, mean, ratio
@@ -72,11 +72,11 @@ class Against:
 
 
 def _draw_panel(ax: Axes, panel: Panel) -> None:
-    for line in panel.lines:
-        look, y = look_of(line.axes), [e.value for e in line.y]
+    for line, look in zip(panel.lines, looks_of([line.axes for line in panel.lines]), strict=True):
+        y = [e.value for e in line.y]
         bars = [[e.value - e.low for e in line.y], [e.high - e.value for e in line.y]]
-        ax.errorbar(line.x, y, yerr=bars, color=look.colour, ls=look.line, marker=look.marker, mfc=look.fill,
-                    capsize=2, lw=1.4, label=line.label)  # fmt: skip
+        ax.errorbar(line.x, y, bars, fmt="none", color=look.colour, capsize=2, lw=1)
+        ax.plot(line.x, y, ls=look.line, lw=1.4, label=line.label, **look.points)
     for line in panel.levels:
         look, estimate = look_of(line.axes), line.y[0]
         ax.axhline(estimate.value, color=look.colour, ls=(0, (2, 2)), lw=1.2, label=line.label)

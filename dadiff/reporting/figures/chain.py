@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from dadiff.reporting.aggregation import Evidence, varying
-from dadiff.reporting.figures.style import legend_below, letter, log_axis, look_of, panels
+from dadiff.reporting.figures.style import legend_below, letter, log_axis, looks_of, panels
 from dadiff.reporting.labels import method_name
 from dadiff.reporting.selection import Selector
 from dadiff.reporting.sources import Cell
@@ -44,8 +44,7 @@ class Chain:
         """Sampling runs from left to right; distances are logarithmic, shares are from 0 to 1."""
         figure, axes = panels(len(PANELS), columns)
         for ax, (name, title) in zip(axes, PANELS.items(), strict=True):
-            for trace in self.traces:
-                look = look_of(trace.axes)
+            for trace, look in zip(self.traces, looks_of([trace.axes for trace in self.traces]), strict=True):
                 ax.plot(trace.steps, trace.values[name], color=look.colour, ls=look.line, lw=1.2, label=trace.label)
             ax.invert_xaxis()
             ax.set_xlabel("diffusion step i")

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from dadiff.reporting.aggregation import Evidence, Method, case_means, varying, weights_for
-from dadiff.reporting.figures.style import legend_below, letter, log_axis, look_of, panels
+from dadiff.reporting.figures.style import legend_below, letter, log_axis, looks_of, panels
 from dadiff.reporting.labels import axis_value, method_name, metric_name
 from dadiff.reporting.selection import Selector
 from dadiff.reporting.statistics import Band, simultaneous_band
@@ -54,12 +54,14 @@ class ErrorsOverTime:
 
 
 def _draw_panel(ax: Axes, panel: Panel, marked: list[int]) -> None:
-    for curve in panel.curves:
-        look, t = look_of(curve.axes), np.arange(len(curve.band.value))
+    for curve, look in zip(panel.curves, looks_of([curve.axes for curve in panel.curves]), strict=True):
+        t = np.arange(len(curve.band.value))
         shown = curve.band.value > 0  # False for nan, too: inputs have no entry at T
         ax.fill_between(t[shown], curve.band.low[shown], curve.band.high[shown], color=look.colour, alpha=0.22, lw=0)
-        ax.plot(t[shown], curve.band.value[shown], color=look.colour, ls=look.line, label=curve.label,
-                marker=look.marker, mfc=look.fill, markevery=max(1, len(t) // 6), ms=4)  # fmt: skip
+        every = max(1, len(t) // 6)
+        ax.plot(
+            t[shown], curve.band.value[shown], ls=look.line, label=curve.label, markevery=every, ms=4, **look.points
+        )
     for t_marked in marked:
         ax.axvline(t_marked, color="#888888", lw=0.8, ls=":", zorder=0)
     log_axis(ax, "y")

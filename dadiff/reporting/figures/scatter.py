@@ -8,7 +8,7 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from dadiff.reporting.aggregation import Evidence, Method, case_scalars, has_metric, varying, weights_for
-from dadiff.reporting.figures.style import PANEL_WIDTH, legend_below, log_axis, look_of, panels
+from dadiff.reporting.figures.style import PANEL_WIDTH, legend_below, log_axis, looks_of, panels
 from dadiff.reporting.labels import method_name, metric_name
 from dadiff.reporting.selection import Selector
 from dadiff.reporting.statistics import Estimate, mean
@@ -40,14 +40,10 @@ class Scatter:
         figure, (ax,) = panels(
             1, columns, width=5.2 if columns > 1 else PANEL_WIDTH, height=3.3 + 0.1 * len(self.points)
         )
-        for point in self.points:
-            look = look_of(point.axes)
+        for point, look in zip(self.points, looks_of([point.axes for point in self.points]), strict=True):
             bars = [[[e.value - e.low], [e.high - e.value]] for e in (point.x, point.y)]
-            ax.errorbar(point.x.value, point.y.value, xerr=bars[0], yerr=bars[1], fmt=look.marker, color=look.colour,
-                        mfc=look.fill, ms=7, capsize=2, lw=1, label=point.label)  # fmt: skip
-        if self.diagonal:
-            ends = [end([e.value for p in self.points for e in (p.x, p.y)]) for end in (min, max)]
-            ax.plot(ends, ends, color="#888888", lw=0.8, ls=":", zorder=0)
+            ax.errorbar(point.x.value, point.y.value, bars[1], bars[0], fmt="none", color=look.colour, capsize=2, lw=1)
+            ax.plot(point.x.value, point.y.value, ls="", ms=7, label=point.label, **look.points)
         log_axis(ax, "x")
         log_axis(ax, "y")
         ax.set_xlabel(metric_name(self.x))

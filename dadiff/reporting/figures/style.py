@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
@@ -36,6 +36,8 @@ LINES = {
     "clean_estimate": (0, (4, 1.5, 1, 1.5)),
     "literal": (0, (8, 2)),
 }
+FILLS = ("full", "none")
+VARIANTS = (((0, (2, 1.5)), "left"), ((0, (6, 1.5)), "bottom"), ((0, (3, 1, 1, 1)), "right"), ((0, (1, 3)), "top"))
 OTHER = ("#5b5bd6", "X")
 PANEL_WIDTH, PANEL_HEIGHT = 3.7, 2.75
 CHARACTER = 0.072  # inches that a character of a legend takes, about
@@ -68,24 +70,39 @@ RC: dict[Any, Any] = {
 
 @dataclass(frozen=True)
 class Look:
-    """How one method is drawn."""
+    """How one method is drawn; `fill` is matplotlib's fillstyle of its markers."""
 
     colour: str
     marker: str
     line: Any
-    filled: bool
+    fill: Any
 
     @property
-    def fill(self) -> str:
-        """Face of its markers: hollow where x(0) is held fixed."""
-        return self.colour if self.filled else "none"
+    def points(self) -> dict[str, Any]:
+        """Keywords for its markers."""
+        return {"color": self.colour, "marker": self.marker, "fillstyle": self.fill, "markerfacecoloralt": "none"}
 
 
 def look_of(axes: Mapping[str, Any]) -> Look:
     """Colour and marker say the projector, the line where it acts, a hollow marker that x(0) is held."""
     projector = axes.get("projector", "")
     colour, marker = COLOURS.get(projector, OTHER[0]), MARKERS.get(projector, OTHER[1])
-    return Look(colour, marker, LINES.get(axes.get("enforcement", ""), "-"), axes.get("initial_state") != "fixed")
+    return Look(
+        colour, marker, LINES.get(axes.get("enforcement", ""), "-"), FILLS[axes.get("initial_state") == "fixed"]
+    )
+
+
+def looks_of(methods: Sequence[Mapping[str, Any]]) -> list[Look]:
+    """As `look_of`; methods that would look alike get other lines and half filled markers, in their order."""
+    looks: list[Look] = []
+    for axes in methods:
+        look = look_of(axes)
+        variant = sum(other == look for other in map(look_of, methods[: len(looks)]))
+        if variant:
+            line, fill = VARIANTS[(variant - 1) % len(VARIANTS)]
+            look = Look(look.colour, look.marker, line, fill)
+        looks.append(look)
+    return looks
 
 
 def panels(
@@ -155,15 +172,23 @@ class Drawable(Protocol):
         ...
 
 
-def render(plotted: Drawable, form: str, columns: int) -> bytes:
-    """The figure as pdf, svg or png, without dates or versions: the same numbers give the same bytes."""
-    metadata = {
-        "pdf": {"CreationDate": None, "Producer": None, "Creator": None},
-        "svg": {"Date": None, "Creator": None, "Format": None, "Type": None},
-        "png": {"Software": None},
-    }
-    buffer = io.BytesIO()
+METADATA: dict[str, dict[str, Any]] = {
+    "pdf": {"CreationDate": None, "Producer": None, "Creator": None},
+    "svg": {"Date": None, "Creator": None, "Format": None, "Type": None},
+    "png": {"Software": None},
+}
+"""None keeps dates and versions out."""
+
+
+def render(plotted: Drawable, columns: int, forms: Sequence[str]) -> dict[str, bytes]:
+    """The figure as pdf, svg or png; the same numbers give the same bytes. The layout is found once for all forms."""
+    rendered = {}
     with matplotlib.rc_context(RC):
         figure = plotted.draw(columns)
-        figure.savefig(buffer, format=form, dpi=160, transparent=form == "svg", metadata=metadata[form])
-    return buffer.getvalue()
+        figure.draw_without_rendering()
+        figure.set_layout_engine("none")
+        for form in forms:
+            buffer = io.BytesIO()
+            figure.savefig(buffer, format=form, dpi=160, transparent=form == "svg", metadata=METADATA[form])
+            rendered[form] = buffer.getvalue()
+    return rendered

@@ -1,0 +1,327 @@
+"""Reports from a small committed store: the same bytes, the expected numbers, no mean over what is lost."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+import pytest
+from made_up import MadeUp
+
+from dadiff.errors import ConfigError, StoreError
+from dadiff.reporting import cli, labels, latex
+from dadiff.reporting.aggregation import Evidence, case_means, case_scalars, pair, varying
+from dadiff.reporting.definitions import Item, for_sweep, load, names
+from dadiff.reporting.figures.style import COLOURS, MARKERS, RC, looks_of, render
+from dadiff.reporting.report import build
+from dadiff.reporting.selection import matches
+from dadiff.reporting.sources import read_sweeps
+
+STORE = Path(__file__).parent / "data" / "store"
+EXPECTED = Path(__file__).parent / "data" / "expected"
+SWEEPS = ("lqr_made_up", "hankel_length_made_up", "obstacles_made_up", "fleet_made_up")
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory) -> Path:
+    """The LQR report, with everything that can go wrong in its sweep."""
+    out = tmp_path_factory.mktemp("report")
+    assert cli.main(["lqr_made_up", "--output-dir", str(STORE), "--out", str(out)]) == 0
+    return out
+
+
+def evidence(name: str) -> Evidence:
+    return Evidence(read_sweeps(STORE, [name]))
+
+
+def flat(value, prefix="") -> dict[str, object]:
+    if isinstance(value, dict | list):
+        items = value.items() if isinstance(value, dict) else enumerate(value)
+        return {name: leaf for key, part in items for name, leaf in flat(part, f"{prefix}/{key}").items()}
+    return {prefix: value}
+
+
+def test_numbers_are_as_expected(report):
+    """`python tests/data/make_expected.py` writes the expectation anew; look at what it changes."""
+    stored = flat(json.loads((EXPECTED / "lqr_made_up.json").read_text()))
+    found = flat(json.loads((report / "report.json").read_text()))
+    assert found.keys() == stored.keys()
+    for name, value in stored.items():
+        assert found[name] == (pytest.approx(value, rel=1e-6) if isinstance(value, float) else value), name
+
+
+def test_tables_hold_the_means_of_the_stored_plans(report):
+    with (report / "tables" / "summary.csv").open() as stream:
+        rows = {row["method"]: row for row in csv.DictReader(stream)}
+    known = evidence("lqr_made_up").methods({"projector": "known", "enforcement": "post_hoc"})[0]
+    errors = [cell.table("per_step")["planned_state_error"].mean() for cell in known.finished]
+    row = rows[next(label for label in rows if label.startswith("known") and "once at the end" in label)]
+    assert float(row["planned_state_error_mean"]) == pytest.approx(np.mean(errors), rel=1e-5)
+    assert float(row["planned_state_error_mean_low"]) < np.mean(errors) < float(row["planned_state_error_mean_high"])
+    assert float(row["planned_state_error_ratio"]) == pytest.approx(0.6, rel=0.1)
+    assert row["runs"].split() == known.keys
+
+
+def test_the_same_store_gives_the_same_bytes(tmp_path):
+    folders = (tmp_path / "a", tmp_path / "b")
+    for folder in folders:
+        assert cli.main(["fleet_made_up", "--output-dir", str(STORE), "--out", str(folder)]) == 0
+    first, second = (
+        {p.relative_to(folder): hashlib.sha256(p.read_bytes()).hexdigest() for p in folder.rglob("*") if p.is_file()}
+        for folder in folders
+    )
+    assert first == second
+    assert {path.suffix for path in first} == {".html", ".json", ".csv", ".tex", ".pdf", ".svg", ".png"}
+
+
+def test_the_page_asks_for_nothing_and_knows_no_place(report):
+    page = (report / "index.html").read_text()
+    assert "<script" not in page
+    assert not any(text in page for text in ('src="http', "@import", "url(http", str(STORE), str(Path.home()) + "/"))
+    assert page.count("<svg") > 5
+
+
+def test_lost_and_double_cells_are_named_and_never_averaged(report):
+    page = (report / "index.html").read_text()
+    for text in ("lqr/known/literal/0: diverged at step 7", "lqr/identified/normalised/0: missing", "the same again"):
+        assert text in page
+    content = json.loads((report / "report.json").read_text())
+    lost = {cell["key"] for cell in content["cells"] if cell["status"] != "finished"}
+    assert len(lost) == 3
+    for part in (*content["tables"].values(), *content["figures"].values()):
+        assert not lost & set(part["runs"])
+    assert [len(group) for group in content["duplicates"]] == [2]
+
+
+def test_every_part_says_how_to_make_it_again_and_from_how_much(report):
+    content = json.loads((report / "report.json").read_text())
+    assert content["commands"][0] == "dadiff +sweeps=lqr_made_up"
+    facts = content["figures"]["errors"]["facts"]
+    assert facts.startswith("6 cases, 3 plans a case, 3 training seeds")
+    page = (report / "index.html").read_text()
+    shown = [part for part in (*content["tables"].values(), *content["figures"].values()) if part["runs"]]
+    assert page.count("dadiff-report lqr_made_up --definition lqr") == len(shown)
+    assert f'href="#run-{content["figures"]["errors"]["runs"][0]}"' in page
+
+
+def test_one_training_seed_is_said(tmp_path):
+    store = MadeUp(tmp_path)
+    store.run(1.0)
+    store.sweep()
+    content = build(load("default"), Evidence(read_sweeps(tmp_path, [store.name])), [], "")
+    assert content.tables[0].facts.endswith("with one training seed: they cover cases only.")
+
+
+def test_whatever_comes_from_a_store_is_escaped(tmp_path):
+    store = MadeUp(tmp_path, "lqr<b>")
+    hostile = r"<script>alert(1)</script> \input{x} $\alpha$ & 5 % _#"
+    store.run(1.0)
+    store.run(0.5, projector=hostile, enforcement=hostile)
+    store.run(projector="known", enforcement=hostile, status="failed", reason=hostile)
+    store.sweep()
+    assert cli.main(["lqr<b>", "--output-dir", str(tmp_path), "--definition", "default", "--out", str(tmp_path)]) == 0
+    page = (tmp_path / "index.html").read_text()
+    assert "<script" not in page
+    assert "&lt;script&gt;" in page
+    tex = (tmp_path / "tables" / "summary.tex").read_text()
+    assert r"\input" not in tex
+    assert r"\textbackslash{}input\{x\} \$\textbackslash{}alpha\$ \& 5 \% \_\#" in tex
+    assert b"<script" not in (tmp_path / "figures" / "errors.svg").read_bytes()
+
+
+def test_latex_sets_numbers_and_signs():
+    assert latex.escape("1.50·10⁻⁷ ‖x‖² †") == r"1.50$\cdot$10$^{-7}$ $\|$x$\|$$^2$ $^\dagger$"
+
+
+@pytest.mark.parametrize("name", SWEEPS)
+def test_figures_through_their_data(name):
+    """What is drawn is what was collected: a line, marker or patch for each method, and its label in the legend."""
+    content = build(for_sweep(name), evidence(name), [], "")
+    drawn = [part for part in content.figures if not part.empty]
+    assert len(drawn) >= 2
+    for part in drawn:
+        with matplotlib.rc_context(RC):
+            figure = part.content.draw(2)
+        figure.draw_without_rendering()
+        assert all(ax.get_title() or ax.get_title("left") or ax.get_xlabel() for ax in figure.axes), part.item.id
+        wanted = {item.label for item in _labelled(part.content)}
+        legend = {text.get_text() for legend in figure.legends for text in legend.get_texts()}
+        ticks = {text.get_text() for ax in figure.axes for text in ax.get_yticklabels()}
+        titles = {text.replace("\n", " ") for ax in figure.axes for text in (ax.get_title(), ax.get_title("left"))}
+        assert wanted <= legend | ticks | {title.removeprefix(title[: title.find(") ") + 2]) for title in titles} | {
+            label for label in wanted if any(label in title for title in titles)
+        }, part.item.id
+
+
+def _labelled(content) -> list:
+    parts = [content, *getattr(content, "panels", [])]
+    names = ("curves", "lines", "points", "traces", "paths")
+    return [item for part in parts for name in names for item in getattr(part, name, [])]
+
+
+def test_curves_are_the_means_and_lie_in_their_bands():
+    content = build(load("lqr"), evidence("lqr_made_up"), [], "")
+    errors = next(part.content for part in content.figures if part.item.id == "errors")
+    vanilla = next(curve for curve in errors.panels[0].curves if curve.label == "vanilla")
+    method = evidence("lqr_made_up").methods({"projector": "none", "denoiser": "mlp"})[0]
+    np.testing.assert_allclose(vanilla.band.value, case_means(method.finished, "planned_state_error").mean((0, 1)))
+    assert (vanilla.band.low < vanilla.band.value).all()
+    assert (vanilla.band.value < vanilla.band.high).all()
+    inputs = next(curve for curve in errors.panels[1].curves if curve.label == "vanilla")
+    assert np.isnan(inputs.band.value[-1])
+    assert np.isfinite(inputs.band.value[:-1]).all()
+
+
+def test_diverged_cells_are_shown_as_such():
+    content = build(load("lqr"), evidence("lqr_made_up"), [], "")
+    rows = next(part.content for part in content.figures if part.item.id == "initial_state").rows[0]
+    (row,) = (row for row in rows if "as printed" in row.label)
+    assert row.estimate is None
+    assert row.outcome == "diverged at step 7"
+
+
+def test_projectors_look_the_same_everywhere_and_differ():
+    assert len({(COLOURS[name], MARKERS[name]) for name in COLOURS}) == len(COLOURS)
+    alike = looks_of([{"projector": "known"}, {"projector": "known"}, {"projector": "none"}])
+    assert alike[0].colour == alike[1].colour != alike[2].colour
+    assert alike[0] != alike[1]
+
+
+def test_phones_get_one_column():
+    content = build(load("lqr"), evidence("lqr_made_up"), [], "")
+    with matplotlib.rc_context(RC):
+        wide, narrow = (content.figures[0].content.draw(columns).get_size_inches() for columns in (2, 1))
+    assert narrow[0] < 4.2 < wide[0]
+
+
+def test_pictures_are_free_of_dates():
+    content = build(load("lqr"), evidence("lqr_made_up"), [], "").figures[0].content
+    for data in render(content, 2, ("pdf", "svg", "png")).values():
+        assert b"Matplotlib" not in data
+        assert b"CreationDate" not in data
+
+
+def test_replicates_are_pooled_and_paired_by_seed():
+    methods = {m.axes.get("enforcement"): m for m in evidence("lqr_made_up").methods({"projector": "known"})}
+    assert len(methods["post_hoc"].finished) == 3
+    partner = evidence("lqr_made_up").partner(methods["post_hoc"], {"projector": "none"})
+    own, theirs = pair(methods["post_hoc"], partner)
+    assert [cell.axes["seed"] for cell in own] == [cell.axes["seed"] for cell in theirs] == [0, 1, 2]
+    assert case_scalars(own, "planned_state_error").shape == (3, 6)
+
+
+def test_cases_of_different_data_are_not_paired(tmp_path):
+    store = MadeUp(tmp_path)
+    store.run(1.0)
+    key = store.run(1.0, projector="known", enforcement="normalised")
+    path = tmp_path / "runs" / key / "run.json"
+    path.write_text(path.read_text().replace('"data0"', '"other"'))
+    store.sweep()
+    everything = Evidence(read_sweeps(tmp_path, [store.name]))
+    with pytest.raises(StoreError, match="data sets differ"):
+        pair(*everything.all_methods)
+
+
+def test_labels_say_the_least_that_tells_methods_apart():
+    methods = evidence("hankel_length_made_up").methods({"projector": ["hankel", "hankel_lowrank"]})
+    assert varying(methods) == ["projector", "recording.length"]
+    assert labels.method_name(methods[0].axes, varying(methods)) == "Hankel HH†, S = 100"
+
+
+def test_rows_that_are_missing_from_a_table_are_an_error(tmp_path):
+    store = MadeUp(tmp_path)
+    key = store.run(1.0)
+    store.sweep()
+    (cell,) = read_sweeps(tmp_path, [store.name]).cells
+    cell.table("per_step").iloc[:-1].to_parquet(tmp_path / "runs" / key / "per_step.parquet")
+    shutil.copytree(tmp_path, tmp_path.with_name("copy"))
+    everything = Evidence(read_sweeps(tmp_path.with_name("copy"), [store.name]))
+    with pytest.raises(StoreError, match="expected each once"):
+        case_means(everything.all_methods[0].finished, "gap")
+
+
+def test_an_unknown_sweep_names_those_that_exist(capsys):
+    assert cli.main(["nonesuch", "--output-dir", str(STORE)]) == 1
+    message = capsys.readouterr().err
+    assert "holds no sweep 'nonesuch'; found fleet_made_up, hankel_length_made_up, lqr_made_up" in message
+
+
+def test_an_empty_store(tmp_path, capsys):
+    assert cli.main(["lqr_quick", "--output-dir", str(tmp_path)]) == 1
+    assert "found none; run `dadiff +sweeps=lqr_quick`" in capsys.readouterr().err
+
+
+def test_a_sweep_without_any_result_is_a_report_that_says_so(tmp_path):
+    store = MadeUp(tmp_path)
+    store.run(stored=False)
+    store.sweep()
+    assert cli.main([store.name, "--output-dir", str(tmp_path)]) == 0
+    page = (tmp_path / "reports" / store.name / "index.html").read_text()
+    assert "1 cells, 0 finished" in page
+    assert "not tested here" in page
+
+
+def test_a_store_of_a_newer_version(tmp_path, capsys):
+    store = MadeUp(tmp_path)
+    key = store.run(1.0)
+    store.sweep()
+    path = tmp_path / "runs" / key / "run.json"
+    path.write_text(path.read_text().replace('"format": 1', '"format": 2'))
+    assert cli.main([store.name, "--output-dir", str(tmp_path)]) == 1
+    assert "has format 2, this version reads up to 1; update dadiff" in capsys.readouterr().err
+
+
+def test_several_sweeps_make_one_report():
+    both = Evidence(read_sweeps(STORE, ["lqr_made_up", "obstacles_made_up"]))
+    figures = {part.item.id: part for part in build(load("quick"), both, [], "").figures}
+    assert figures["lqr_errors"].runs
+    assert figures["obstacle_errors"].runs
+
+
+def test_definitions_are_checked():
+    assert "lqr" in names()
+    for name in names():
+        for item in (*load(name).figures, *load(name).tables):
+            assert item.collect
+    with pytest.raises(ConfigError, match=r"unknown kind 'pie'; expected against, chain, diffusion"):
+        _ = Item("a", "b", kind="pie").collect
+    with pytest.raises(
+        ConfigError, match="report item a: missing a required argument: 'rows'; see the options of kind 'matrix'"
+    ):
+        _ = Item("a", "b", kind="matrix", options={"metrix": "gap"}).collect
+    with pytest.raises(ConfigError, match="no report definition 'nonesuch'; found"):
+        load("nonesuch")
+
+
+@pytest.mark.parametrize(
+    ("selector", "meets"),
+    [
+        ({"a": 1}, True),
+        ({"a": [2, 1]}, True),
+        ({"b": None}, True),
+        ({"a": {"above": 0, "below": 2}}, True),
+        ({"a": {"not": [1, 2]}}, False),
+        ({"b": {"above": 0}}, False),
+    ],
+)
+def test_selectors(selector, meets):
+    assert matches({"a": 1}, selector) is meets
+
+
+def test_a_misspelt_comparison_is_named():
+    with pytest.raises(ConfigError, match="unknown comparison 'abvoe'"):
+        matches({"a": 1}, {"a": {"abvoe": 0}})
+
+
+def test_reports_need_no_torch(tmp_path):
+    code = "import sys; from dadiff.reporting.cli import main; print(main(sys.argv[1:]), 'torch' in sys.modules)"
+    arguments = ["hankel_length_made_up", "--output-dir", str(STORE), "--out", str(tmp_path)]
+    done = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=True)
+    assert done.stdout.split()[-2:] == ["0", "False"]
