@@ -8,7 +8,7 @@ export MLFLOW_DISABLE_TELEMETRY := true
 .PHONY: help install report test slow lint bench clean
 
 help:
-	@echo "make report   quick comparison of projectors, and its report"
+	@echo "make report   quick comparisons on both tasks, and their reports"
 	@echo "make test     the default test suite"
 	@echo "make slow     the tests that take long"
 	@echo "make lint     ruff and mypy"
@@ -24,6 +24,11 @@ install: .venv/installed
 report: install
 	$(RUN)/dadiff +sweeps=lqr_quick output_dir=$(OUTPUTS)
 	$(RUN)/dadiff-report lqr_quick --output-dir $(OUTPUTS)
+	$(RUN)/dadiff +sweeps=obstacles_quick output_dir=$(OUTPUTS)
+	$(RUN)/dadiff-report obstacles_quick --output-dir $(OUTPUTS)
+	@echo
+	@echo "reports: $(OUTPUTS)/reports/lqr_quick/index.html  $(OUTPUTS)/reports/obstacles_quick/index.html"
+	@echo "runs:    $(RUN)/mlflow ui --backend-store-uri sqlite:///$(abspath $(OUTPUTS))/mlflow.db"
 
 test: install
 	OMP_NUM_THREADS=1 $(RUN)/pytest

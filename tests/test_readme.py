@@ -1,0 +1,57 @@
+"""Every command and every example of the README runs."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+README = (Path(__file__).parent.parent / "README.md").read_text()
+SMALL = (
+    "dataset.train_size=40 dataset.test_size=2 evaluation.samples=1 schedule.num_steps=30 training.steps=3 "
+    "training.warmup=0 sampler.skip_below=0 progress=false"
+).split()
+
+
+def blocks(language: str) -> list[str]:
+    found = re.findall(rf"^( *)```{language}\n(.*?)^ *```", README, flags=re.DOTALL | re.MULTILINE)
+    return [re.sub(rf"^{indent}", "", text, flags=re.MULTILINE) for indent, text in found]
+
+
+COMMANDS = [line.split("#")[0].split()[1:] for line in "".join(blocks("sh")).splitlines() if line.startswith("dadiff")]
+EXAMPLES = [block for block in blocks("python") if "class " not in block]
+
+
+def dadiff(arguments: list[str], folder: Path) -> subprocess.CompletedProcess:
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(folder)}
+    command = [sys.executable, "-m", "dadiff", *arguments]
+    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=250, check=False)
+
+
+@pytest.mark.parametrize("arguments", COMMANDS, ids=" ".join)
+def test_commands_run(arguments, tmp_path):
+    small = [] if "dry_run=true" in arguments else SMALL
+    done = dadiff([*arguments, *small], tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "normalised" in done.stdout + done.stderr
+
+
+@pytest.mark.parametrize("example", EXAMPLES, ids=lambda text: text.splitlines()[0])
+def test_examples_run(example):
+    exec(compile(example, "README.md", "exec"), {})
+
+
+def test_the_projector_of_the_readme_is_one_class_and_one_yaml(tmp_path):
+    (tmp_path / "mylab").mkdir()
+    (tmp_path / "mylab/projectors.py").write_text(next(block for block in blocks("python") if "class Damped" in block))
+    (tmp_path / "myconf/projector").mkdir(parents=True)
+    (tmp_path / "myconf/projector/damped.yaml").write_text("_target_: mylab.projectors.Damped\n")
+    chosen = ["--config-dir", "myconf", "projector=damped", "denoiser=gaussian"]
+    done = dadiff([*chosen, "components=[mylab]", *SMALL], tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "lqr/damped/normalised/gaussian" in done.stdout
+    refused = dadiff([*chosen, *SMALL], tmp_path)
+    assert refused.returncode == 1
+    assert "components=[mylab]" in refused.stderr
