@@ -64,9 +64,9 @@ def test_a_run_is_mirrored_with_curves_scalars_and_tables(tracking, tmp_path):
     tracking.log_run(run, tracking.start(run.key, run.name, tmp_path))
     (mirror,) = runs(tracking)
     client = open_client(tracking.uri)
-    curve = client.get_metric_history(mirror.info.run_id, "along_time/gap")
+    curve = client.get_metric_history(mirror.info.run_id, "t/gap")
     assert [(point.step, point.value) for point in curve] == [(0, 0.0), (1, 3.0)]
-    assert [p.step for p in client.get_metric_history(mirror.info.run_id, "along_time/planned_input_error")] == [0]
+    assert [p.step for p in client.get_metric_history(mirror.info.run_id, "t/planned_input_error")] == [0]
     assert mirror.data.metrics["gap"] == 1.5
     assert "cost_ratio" not in mirror.data.metrics
     assert mirror.data.params == {"projector": "known", "seed": "1"}
@@ -83,7 +83,7 @@ def test_nothing_is_logged_twice(tracking, tmp_path):
     for _ in range(3):
         tracking.log_run(run)
     (mirror,) = runs(tracking)
-    assert len(open_client(tracking.uri).get_metric_history(mirror.info.run_id, "along_time/gap")) == 2
+    assert len(open_client(tracking.uri).get_metric_history(mirror.info.run_id, "t/gap")) == 2
 
 
 def test_logging_that_was_cut_short_goes_on_in_the_same_run(tracking, tmp_path, monkeypatch, caplog):
@@ -103,7 +103,7 @@ def test_logging_that_was_cut_short_goes_on_in_the_same_run(tracking, tmp_path, 
     (mirror,) = runs(tracking)
     assert mirror.info.status == "FINISHED"
     assert is_tracked(run.folder, tracking.uri)
-    assert len(open_client(tracking.uri).get_metric_history(mirror.info.run_id, "along_time/gap")) == 2
+    assert len(open_client(tracking.uri).get_metric_history(mirror.info.run_id, "t/gap")) == 2
 
 
 def test_a_result_done_again_replaces_its_mirror(tracking, tmp_path):

@@ -24,7 +24,7 @@ HEADLINE = (
     "sampling_seconds",
 )
 INDICES = ("robot", "case", "sample", "t", "step")
-ALONG_TIME = "along_time/"
+OVER_TIME = "t/"
 ARTIFACTS = (".json", ".yaml", ".parquet", ".csv", ".png", ".svg", ".pdf")
 
 
@@ -74,7 +74,7 @@ def scalars(run: StoredRun) -> list[tuple[str, float, int]]:
 
 def curves(run: StoredRun) -> list[tuple[str, float, int]]:
     """Means over robots, cases and samples at each t."""
-    return _columns(run.table("per_step"), "t", ALONG_TIME) if run.has("per_step") else []
+    return _columns(run.table("per_step"), "t", OVER_TIME) if run.has("per_step") else []
 
 
 def _columns(table: pd.DataFrame, index: str, prefix: str = "") -> list[tuple[str, float, int]]:
@@ -93,7 +93,7 @@ def run_note(run: StoredRun) -> str:
     counts = ", ".join(f"{count} {what}" for what, count in run.record.get("counts", {}).items() if count)
     lines = [f"**{run.name}**: {run.status}" + (f" ({run.record['reason']})" if run.record.get("reason") else "") + "."]
     if counts:
-        lines.append(f"Headline metrics are means over {counts} and over time; `{ALONG_TIME}…` are means at each t.")
+        lines.append(f"Headline metrics are means over {counts} and over time; `{OVER_TIME}…` are means at each t.")
     if run.axes:
         lines.append("\n".join(["| parameter | value |", "|---|---|", *_rows(run.axes)]))
     lines.append(f"Tables and the resolved configuration are among the artifacts and in `{run.folder}`.")

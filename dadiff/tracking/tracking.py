@@ -207,12 +207,13 @@ class Tracking:
             if marker is not None and not self._is_gone(marker.run_id):
                 self._drop(run_id)
                 run_id = marker.run_id
+            live = run_id is not None
             run_id = run_id or self.start(key, name, output_dir, kind, content.started)
             if run_id is None:
                 return
             write_marker(folder, self.uri, Marker(run_id, self._experiment_id, complete=False))
             self._log(run_id, content)
-            self._client.set_terminated(run_id, "FINISHED", end_time=content.time or None)
+            self._client.set_terminated(run_id, "FINISHED", end_time=None if live else content.time or None)
             self._remove_older(run_id, key, kind, output_dir)
             write_marker(folder, self.uri, Marker(run_id, self._experiment_id, complete=True))
 

@@ -124,7 +124,7 @@ def mlflow_problems(root: Path) -> list[str]:
         problems.append(f"MLflow has finished runs {kinds}")
     for run in finished:
         if run.data.tags["kind"] == "run":
-            steps = [point.step for point in client.get_metric_history(run.info.run_id, "along_time/gap")]
+            steps = [point.step for point in client.get_metric_history(run.info.run_id, "t/gap")]
             problems += (
                 [] if steps == sorted(set(steps)) and len(steps) == 31 else [f"curve of {run.info.run_name}: {steps}"]
             )
