@@ -8,9 +8,12 @@ from typing import Any
 
 import numpy as np
 import yaml
+from hydra import compose, initialize_config_dir
 
 from dadiff.config import build
 from dadiff.config.build import resolve
+from dadiff.config.composed import plain
+from dadiff.launching import register
 from dadiff.systems import GaussianExcitation, LinearSystem, double_integrator
 
 CONF = Path(__file__).parent.parent / "conf"
@@ -57,6 +60,14 @@ def members(robots: LinearSystem) -> list[LinearSystem]:
 def presets(group: str) -> list[str]:
     """The names of a group's presets, as found in conf/."""
     return sorted(file.stem for file in (CONF / group).glob("*.yaml"))
+
+
+def composed(*overrides: str, conf: Path = CONF) -> dict[str, Any]:
+    """The real configuration with overrides, resolved, as a run gets it."""
+    register()
+    with initialize_config_dir(str(conf), version_base="1.3"):
+        config = compose("config", overrides=list(overrides), return_hydra_config=True)
+    return plain(config, config.hydra.runtime.choices)
 
 
 def node(group: str, preset: str) -> dict[str, Any]:

@@ -54,19 +54,23 @@ def resolve(node: Mapping[str, Any], where: str, trusted: Sequence[str] = ()) ->
     Raises:
         ConfigError: if it is missing, not trusted, or cannot be found.
     """
-    path = node.get(TARGET)
+    path, trusted = node.get(TARGET), {"dadiff", *trusted}
     if not isinstance(path, str) or "." not in path:
         raise ConfigError(f"{where}: {TARGET} is {path!r}; expected the dotted name of a class or function")
-    if path.split(".")[0] not in {"dadiff", *trusted}:
+    if path.split(".")[0] not in trusted:
         raise ConfigError(
             f"{where}: {TARGET} {path} lies outside dadiff and is not built; "
             f"to trust its package add components=[{path.split('.')[0]}]"
         )
     module, _, name = path.rpartition(".")
     try:
-        return getattr(importlib.import_module(module), name)
+        target = getattr(importlib.import_module(module), name)
     except (ModuleNotFoundError, AttributeError) as error:
         raise ConfigError(f"{where}: {TARGET} {path} cannot be found ({error})") from error
+    # What a trusted module has itself imported, such as pathlib.Path, is not the trusted package's.
+    if not callable(target) or target.__module__.split(".")[0] not in trusted:
+        raise ConfigError(f"{where}: {TARGET} {path} is no class or function of {path.split('.')[0]}")
+    return target
 
 
 def check(node: Mapping[str, Any], target: Callable[..., Any], where: str) -> dict[str, Any]:
@@ -81,6 +85,9 @@ def check(node: Mapping[str, Any], target: Callable[..., Any], where: str) -> di
     for name, parameter in parameters.items():
         if parameter.default is parameter.empty and given.get(name) is None:
             raise ConfigError(f"{where}: {name} is missing; give {where.split()[0]}.{name}=...")
+    for key in given:
+        if key not in hints:
+            raise ConfigError(f"{where}: {key} has no type in {target.__qualname__}; annotate every parameter")
     return {key: _typed(value, hints[key], f"{where}: {key}") for key, value in given.items()}
 
 
