@@ -72,7 +72,7 @@ def test_tables_hold_the_means_of_the_stored_plans(report):
 def test_the_same_store_gives_the_same_bytes(tmp_path):
     folders = (tmp_path / "a", tmp_path / "b")
     for folder in folders:
-        assert cli.main(["fleet_made_up", "--output-dir", str(STORE), "--out", str(folder)]) == 0
+        assert cli.main(["hankel_length_made_up", "--output-dir", str(STORE), "--out", str(folder)]) == 0
     first, second = (
         {p.relative_to(folder): hashlib.sha256(p.read_bytes()).hexdigest() for p in folder.rglob("*") if p.is_file()}
         for folder in folders
@@ -149,7 +149,6 @@ def test_figures_through_their_data(name):
     for part in drawn:
         with matplotlib.rc_context(RC):
             figure = part.content.draw(2)
-        figure.draw_without_rendering()
         assert all(ax.get_title() or ax.get_title("left") or ax.get_xlabel() for ax in figure.axes), part.item.id
         wanted = {item.label for item in _labelled(part.content)}
         legend = {text.get_text() for legend in figure.legends for text in legend.get_texts()}

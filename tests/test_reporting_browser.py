@@ -1,0 +1,113 @@
+"""The report as a browser shows it: no error, no request, nothing wider than the page, readable in both schemes."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dadiff.reporting import cli
+
+pytestmark = pytest.mark.slow
+
+STORE = Path(__file__).parent / "data" / "store"
+PHONE, PAGE = (390, 800), (1100, 900)
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory) -> Iterator[Any]:
+    """Headless Chromium."""
+    webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
+    program, driver = (shutil.which(name) for name in ("chromium", "chromedriver"))
+    if not (program and driver):
+        pytest.skip("chromium and chromedriver are not installed (apt-get install chromium chromium-driver)")
+    options = webdriver.ChromeOptions()
+    options.binary_location = program
+    quiet = ("no-first-run", "disable-background-networking", "disable-component-update", "disable-sync")
+    for name in ("headless=new", "no-sandbox", "disable-gpu", "hide-scrollbars", *quiet):
+        options.add_argument(f"--{name}")
+    options.add_argument(f"--user-data-dir={tmp_path_factory.mktemp('chromium')}")
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
+    chrome = webdriver.Chrome(options=options, service=webdriver.ChromeService(driver))
+    yield chrome
+    chrome.quit()
+
+
+@pytest.fixture(scope="module", params=["lqr_made_up", "obstacles_made_up", "hankel_length_made_up", "fleet_made_up"])
+def page(request, tmp_path_factory) -> str:
+    """The address of a report."""
+    out = tmp_path_factory.mktemp(request.param)
+    assert cli.main([request.param, "--output-dir", str(STORE), "--out", str(out)]) == 0
+    return (out / "index.html").as_uri()
+
+
+def show(browser: Any, page: str, size: tuple[int, int], scheme: str) -> None:
+    """Open a page on a screen of some size, in a colour scheme."""
+    features = [{"name": "prefers-color-scheme", "value": scheme}]
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": features})
+    metrics = {"width": size[0], "height": size[1], "deviceScaleFactor": 1, "mobile": size == PHONE}
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
+    browser.get_log("performance")
+    browser.get(page)
+
+
+def test_no_error_and_no_request_leaves_the_page(browser, page):
+    show(browser, page, PAGE, "light")
+    assert browser.get_log("browser") == []
+    requests = [
+        entry["message"] for entry in browser.get_log("performance") if "Network.requestWillBeSent" in entry["message"]
+    ]
+    assert not [message for message in requests if '"url":"http' in message]
+
+
+@pytest.mark.parametrize("size", [PHONE, PAGE])
+def test_nothing_is_wider_than_the_page(browser, page, size):
+    show(browser, page, size, "light")
+    assert browser.execute_script("return document.documentElement.scrollWidth") <= size[0]
+    visible = "return [...document.querySelectorAll('svg')].filter(s => s.getClientRects().length).length"
+    assert browser.execute_script(visible) == browser.execute_script(
+        "return document.querySelectorAll('figure').length"
+    )
+
+
+def test_texts_of_figures_lie_inside_of_them(browser, page):
+    show(browser, page, PAGE, "light")
+    outside = browser.execute_script(
+        """return [...document.querySelectorAll('svg')].filter(s => s.getClientRects().length).flatMap(svg => {
+             const box = svg.getBoundingClientRect();
+             return [...svg.querySelectorAll('text')].filter(t => t.textContent.trim()).filter(t => {
+               const r = t.getBoundingClientRect();
+               return r.left < box.left - 2 || r.right > box.right + 2
+                 || r.bottom > box.bottom + 2 || r.top < box.top - 2;
+             }).map(t => t.textContent)})"""
+    )
+    assert outside == []
+
+
+def test_both_schemes_are_readable(browser, page):
+    colours = {}
+    for scheme in ("light", "dark"):
+        show(browser, page, PAGE, scheme)
+        colours[scheme] = browser.execute_script(
+            """const text = document.querySelector('svg text'), body = getComputedStyle(document.body);
+               return [body.backgroundColor, getComputedStyle(text).fill]"""
+        )
+    for page_colour, ink in colours.values():
+        assert contrast(page_colour, ink) > 7
+    assert colours["light"] != colours["dark"]
+
+
+def contrast(first: str, second: str) -> float:
+    """The contrast ratio of WCAG 2 of two colours `rgb(r, g, b)`."""
+    light, dark = sorted((luminance(colour) for colour in (first, second)), reverse=True)
+    return (light + 0.05) / (dark + 0.05)
+
+
+def luminance(colour: str) -> float:
+    """Relative luminance of WCAG 2."""
+    parts = [int(float(part)) / 255 for part in colour[colour.index("(") + 1 : -1].split(",")[:3]]
+    linear = [part / 12.92 if part <= 0.03928 else ((part + 0.055) / 1.055) ** 2.4 for part in parts]
+    return sum(weight * part for weight, part in zip((0.2126, 0.7152, 0.0722), linear, strict=True))
