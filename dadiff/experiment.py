@@ -106,11 +106,12 @@ def projection_of(experiment: Experiment, x_init: np.ndarray) -> tuple[Projectio
 def draw_plans(experiment: Experiment) -> Plans:
     """Sample plans for every case, with the same noise whatever the projector."""
     _check_enforcement(experiment)
-    parts, (_, cases) = experiment.parts, experiment.data
-    evaluation, schedule, denoiser = parts["evaluation"], parts["schedule"], experiment.denoiser
+    parts, cases = experiment.parts, experiment.cases
+    evaluation, schedule = parts["evaluation"], parts["schedule"]
     environment = np.repeat(cases.environment, evaluation.samples, axis=-2)
     projection, measures = projection_of(experiment, np.repeat(cases.x_init, evaluation.samples, axis=-2))
     project = Timed(projection.map(lambda a: torch.as_tensor(a, device=experiment.device))) if projection else None
+    denoiser = experiment.denoiser  # after the projection, which may refuse what it is given
     chain, snapshots = _observers(experiment, environment)
     shape = (*environment.shape[:-1], experiment.layout.size)
     start = time.perf_counter()
@@ -150,7 +151,7 @@ def _observers(experiment: Experiment, environment: np.ndarray) -> tuple[ChainRe
 def _store(experiment: Experiment, config: Mapping[str, Any], plans: Plans, started: float) -> StoredRun:
     """Evaluate and write. Of a diverged chain nothing but where it diverged, and how its distance went."""
     identity, diverged_at = experiment.identity, plans.samples.diverged_at
-    artefacts = (identity.dataset, identity.denoiser, identity.recording)
+    artefacts = (identity.demonstrations, identity.cases, identity.denoiser)
     record = {
         "key": identity.key,
         "name": identity.name,
@@ -160,7 +161,7 @@ def _store(experiment: Experiment, config: Mapping[str, Any], plans: Plans, star
         "config": dict(config),
         "axes": identity.axes,
         "metrics": plans.measures,
-        "notes": {"dataset": experiment.data[1].notes, "schedule": experiment.parts["schedule"].conditions()},
+        "notes": {"cases": experiment.cases.notes, "schedule": experiment.parts["schedule"].conditions()},
         "counts": _counts(experiment),
         "links": {artefact.kind: artefact.key for artefact in artefacts if artefact},
         "provenance": provenance(experiment.device, started),
@@ -182,7 +183,7 @@ def _store(experiment: Experiment, config: Mapping[str, Any], plans: Plans, star
 
 def evaluate(experiment: Experiment, planned: np.ndarray) -> Scores:
     """What can be said of plans (*robots, cases, samples, d): errors along time, and the task's own scores."""
-    system, layout, cases = experiment.target, experiment.layout, experiment.data[1]
+    system, layout, cases = experiment.target, experiment.layout, experiment.cases
     rollout = replay(system, layout, planned, cases.x_init)
     return merged(
         tracking_errors(system, layout, cases, planned, rollout),
@@ -197,7 +198,7 @@ def examples(experiment: Experiment, plans: Plans) -> dict[str, np.ndarray]:
     reference_inputs (cases, T, m), environment (cases, c). Of a fleet all these have a first dimension of a few robots
     that differ most, `robots` (k,) says which ones, and their first case is the same.
     """
-    layout, cases, count = experiment.layout, experiment.data[1], experiment.parts["evaluation"].examples
+    layout, cases, count = experiment.layout, experiment.cases, experiment.parts["evaluation"].examples
     system, shown = _shown(experiment.target)
     planned = plans.planned[shown][..., :count, :, :]
     reference, environment, x_init = (
@@ -238,6 +239,6 @@ def _noised(experiment: Experiment, reference: np.ndarray, steps: np.ndarray) ->
 
 
 def _counts(experiment: Experiment) -> dict[str, int]:
-    *robots, num_cases, _ = experiment.data[1].environment.shape
+    *robots, num_cases, _ = experiment.cases.environment.shape
     counts = {"cases": num_cases, "samples": experiment.parts["evaluation"].samples}
     return counts | ({"robots": robots[0]} if robots else {})
