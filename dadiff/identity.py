@@ -127,8 +127,9 @@ def _axes(choices: Mapping[str, str], nodes: Mapping[str, Mapping[str, Any]], pa
 
 
 def _name(choices: Mapping[str, str], nodes: Mapping[str, Mapping[str, Any]], parts: Parts) -> str:
-    fixed = nodes["projector"].get("initial_state") == "fixed"
-    words = [_word("task", choices, nodes), _word("projector", choices, nodes) + ("_fixed" if fixed else "")]
+    projector = _word("projector", choices, nodes)
+    fixed = nodes["projector"].get("initial_state") == "fixed" and not projector.endswith("_fixed")
+    words = [_word("task", choices, nodes), projector + ("_fixed" if fixed else "")]
     if "recording" in choices and "length" in nodes["recording"]:
         recording = nodes["recording"]
         words += [f"S={recording['length']}", f"w={recording['process_noise']}"]
