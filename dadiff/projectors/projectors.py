@@ -175,17 +175,20 @@ def _decompose(recording: Recording, layout: Layout) -> tuple[np.ndarray, np.nda
     """Left singular vectors, singular values and rank of the stack H.
 
     Raises:
-        ExcitationError: if its rank is below n + mT, or differs between robots.
+        ExcitationError: if x(0) and u(0:T-1) of the windows do not span n + mT dimensions (Willems' condition, which
+            noise cannot feign: under feedback alone u(0) follows from x(0)), or the rank differs between robots.
     """
     H = trajectory_matrix(recording.states, recording.inputs, layout)
+    sources = np.concatenate([H[..., layout.initial_state, :], H[..., layout.all_inputs, :]], axis=-2)
+    if (found := numerical_rank(sources)) < layout.rank:
+        raise ExcitationError(
+            f"recording: x(0) and u(0:T-1) of its windows have rank {found}, n + mT = {layout.rank} are needed: the "
+            "inputs do not excite the system; record with inputs that vary independently of the state (not under "
+            "feedback alone)"
+        )
     U, s, _ = np.linalg.svd(H, full_matrices=False)
     ranks = (s > rank_tolerance(s, H.shape)).sum(axis=-1)
     rank = int(ranks.min())
-    if rank < layout.rank:
-        raise ExcitationError(
-            f"recording: its Hankel matrix has rank {rank}, n + mT = {layout.rank} are needed: the inputs do "
-            "not excite the system; record with inputs that vary independently of the state (not under feedback alone)"
-        )
     if rank < ranks.max():
         raise ExcitationError(
             f"recording: the robots' Hankel matrices have ranks from {rank} to {int(ranks.max())}; "
