@@ -111,7 +111,7 @@ def definition(config: DictConfig) -> dict[str, str]:
     """What the sweep ranges over and fixes: its file's parameters, and the command's on top."""
     given = (str(override).partition("=") for override in config.hydra.overrides.task)
     params = {str(name): str(value) for name, value in (config.hydra.sweeper.get("params") or {}).items()}
-    return params | {name: value for name, _, value in given}
+    return params | {name.lstrip("+~"): value for name, _, value in given}
 
 
 def _say_over(run: SweepRun) -> bool:

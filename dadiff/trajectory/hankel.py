@@ -46,11 +46,10 @@ def trajectory_matrix(states: np.ndarray, inputs: np.ndarray, layout: Layout) ->
     """
     count, length = inputs.shape[-3], inputs.shape[-2]
     if count * (length - layout.horizon + 1) < layout.rank:
-        recordings = f"{count} recordings" if count > 1 else "the recording"
+        found = count * max(0, length - layout.horizon + 1)
         raise ExcitationError(
-            f"recording: S = {length} is too short: {recordings} give {max(0, count * (length - layout.horizon + 1))} "
-            f"windows of T = {layout.horizon}; n + mT = {layout.rank} are needed: record S >= "
-            f"{minimum_length(layout, count)}"
+            f"recording: S = {length} is too short: {count} x {length} inputs give {found} windows of "
+            f"T = {layout.horizon}; n + mT = {layout.rank} are needed: record S >= {minimum_length(layout, count)}"
         )
     columns = layout.flatten(windows(states, layout.horizon + 1), windows(inputs, layout.horizon))
     return columns.reshape(*columns.shape[:-3], -1, layout.size).swapaxes(-1, -2)
