@@ -97,7 +97,7 @@ class Experiment:
         """The exact denoiser, or the trained one from the cache or trained now."""
         recipe, schedule = self.parts["denoiser"], self.parts["schedule"]
         if not recipe.trainable:
-            return recipe.exact(self._law(), self.coordinates, schedule)
+            return recipe.exact(self._law(), self.coordinates, schedule, self.device)
         folder = self._cached(self.identity.denoiser, self._train, resumable=True)
         environment_dim = self.cases.environment.shape[-1]
         return load(folder / "model.safetensors", recipe, self.layout, environment_dim, schedule).to(self.device)
@@ -109,13 +109,13 @@ class Experiment:
     def _law(self) -> Any:
         task = self.parts["task"]
         if not hasattr(task, "law"):
-            raise ConfigError("denoiser: the exact denoiser needs a task whose law is Gaussian; use task=lqr or denoiser=mlp")
+            raise ConfigError(
+                "denoiser: the exact denoiser needs a task whose law is Gaussian; use task=lqr or denoiser=mlp"
+            )
         return task.law(self.target)
 
     def _cached(self, artefact: Artefact, build: Callable[[Path], None], *, resumable: bool = False) -> Path:
-        return self.cache.get_or_build(
-            artefact.kind, artefact.key, artefact.determined_by, build, resumable=resumable
-        )
+        return self.cache.get_or_build(artefact.kind, artefact.key, artefact.determined_by, build, resumable=resumable)
 
     def _train(self, folder: Path) -> None:
         demonstrations = self.demonstrations

@@ -84,7 +84,11 @@ def assemble(config: Mapping[str, Any], choices: Mapping[str, str] | None = None
     nodes = {group: (_node(config, group), where(group, choices)) for group in GROUPS}
     for node, place in nodes.values():
         check(node, resolve(node, place, settings.components), place)
-    return Parts(settings, {group: build(node, place, settings.components) for group, (node, place) in nodes.items()})
+    built = {}
+    for group in reversed(GROUPS):  # the system last: it loads python-control, and mistakes elsewhere are told before
+        node, place = nodes[group]
+        built[group] = build(node, place, settings.components)
+    return Parts(settings, built)
 
 
 def complete(config: Mapping[str, Any]) -> dict[str, Any]:
