@@ -64,7 +64,8 @@ def main(repeats: int = 5) -> None:
     call = np.array([(one.projecting(), many.projecting()) for _ in range(20)]).min(axis=0)
     print(f"{PLANS} plans of one robot {seconds[0]:.2f} s, of 20 robots {seconds[1]:.2f} s")
     print(f"  ratio {seconds[1] / seconds[0]:.2f} (at most 1.3), {torch.get_num_threads()} threads")
-    print(f"  one projection {1e3 * call[0]:.1f} and {1e3 * call[1]:.1f} ms, setup {one.setup:.2f} and {many.setup:.2f} s")
+    print(f"  one projection {1e3 * call[0]:.1f} and {1e3 * call[1]:.1f} ms")
+    print(f"  setup {one.setup:.2f} and {many.setup:.2f} s")
 
 
 if __name__ == "__main__":
