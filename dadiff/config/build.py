@@ -54,10 +54,10 @@ def resolve(node: Mapping[str, Any], where: str, trusted: Sequence[str] = ()) ->
     Raises:
         ConfigError: if it is missing, not trusted, or cannot be found.
     """
-    path, trusted = node.get(TARGET), {"dadiff", *trusted}
+    path, roots = node.get(TARGET), {"dadiff", *trusted}
     if not isinstance(path, str) or "." not in path:
         raise ConfigError(f"{where}: {TARGET} is {path!r}; expected the dotted name of a class or function")
-    if path.split(".")[0] not in trusted:
+    if path.split(".")[0] not in roots:
         raise ConfigError(
             f"{where}: {TARGET} {path} lies outside dadiff and is not built; "
             f"to trust its package add components=[{path.split('.')[0]}]"
@@ -68,7 +68,7 @@ def resolve(node: Mapping[str, Any], where: str, trusted: Sequence[str] = ()) ->
     except (ModuleNotFoundError, AttributeError) as error:
         raise ConfigError(f"{where}: {TARGET} {path} cannot be found ({error})") from error
     # What a trusted module has itself imported, such as pathlib.Path, is not the trusted package's.
-    if not callable(target) or target.__module__.split(".")[0] not in trusted:
+    if not callable(target) or target.__module__.split(".")[0] not in roots:
         raise ConfigError(f"{where}: {TARGET} {path} is no class or function of {path.split('.')[0]}")
     return target
 
