@@ -63,6 +63,8 @@ class MadeUp:
         tables = {"chain": chain} if chain is not None else {}
         if status == "finished":
             draw = Draw(self.sizes, self.horizon, int(axes["seed"]), key, spread, robots)
+            if robots is not None:
+                tables["robots"] = robot_table(len(robots))
             tables["per_step"] = draw.per_step({m: (levels or {}).get(m, level) for m in PER_STEP}, shape)
             tables["per_plan"] = draw.per_plan(
                 {"initial_state_error": level, "cost_ratio": 1 + level, **(per_plan or {})}
@@ -122,6 +124,13 @@ class Draw:
         columns = {name: level * self.factor[..., 0] for name, level in levels.items()}
         columns["cost_ratio"] = 1 + (levels["cost_ratio"] - 1) * self.factor[..., 0]
         return self._table(columns, ("robot", "case", "sample"))
+
+
+def robot_table(count: int) -> pd.DataFrame:
+    """The first half inside the training ranges, the others further and further outside."""
+    distance = np.maximum(np.arange(count) - count // 2 + 1, 0) / count
+    group = np.where(distance > 0, "extrapolation", "interpolation")
+    return pd.DataFrame({"robot": np.arange(count), "group": group, "distance": distance})
 
 
 def chain_table(steps: int, *, grows: bool) -> pd.DataFrame:

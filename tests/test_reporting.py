@@ -161,7 +161,7 @@ def test_figures_through_their_data(name):
 
 def _labelled(content) -> list:
     parts = [content, *getattr(content, "panels", [])]
-    names = ("curves", "lines", "points", "traces", "paths")
+    names = ("curves", "lines", "points", "traces")
     return [item for part in parts for name in names for item in getattr(part, name, [])]
 
 
@@ -214,6 +214,24 @@ def test_replicates_are_pooled_and_paired_by_seed():
     own, theirs = pair(methods["post_hoc"], partner)
     assert [cell.axes["seed"] for cell in own] == [cell.axes["seed"] for cell in theirs] == [0, 1, 2]
     assert case_scalars(own, "planned_state_error").shape == (3, 6)
+
+
+def test_presets_go_by_the_projector_that_they_set(tmp_path):
+    store = MadeUp(tmp_path)
+    store.run(1.0)
+    store.run(0.1, projector="known_fixed", enforcement="normalised", initial_state="fixed")
+    store.sweep()
+    everything = Evidence(read_sweeps(tmp_path, [store.name]))
+    (fixed,) = everything.methods({"projector": "known", "initial_state": "fixed"})
+    assert everything.partner(fixed, {"projector": "none"}) is not None
+
+
+def test_robots_by_group():
+    method = evidence("fleet_made_up").methods({"projector": "none"})[0]
+    everyone = case_scalars(method.finished, "cost_ratio")
+    groups = [case_scalars(method.finished, "cost_ratio", group) for group in ("interpolation", "extrapolation")]
+    assert everyone.shape == (1, 8, 4)
+    np.testing.assert_array_equal(np.concatenate(groups, axis=1), everyone)
 
 
 def test_cases_of_different_data_are_not_paired(tmp_path):

@@ -84,7 +84,7 @@ def difference_store(folder: Path, claim: Claim, truth: str) -> MadeUp:
 
 
 def dip_store(folder: Path, claim: Claim, truth: str) -> MadeUp:
-    store, at = MadeUp(folder, horizon=40), np.isin(np.arange(41), claim.options["times"])
+    store, at = MadeUp(folder, cases=30, horizon=40), np.isin(np.arange(41), claim.options["times"])
     shape = 1 + {"holds": -0.7, "does not hold": 2.0, "undecided": 0.0}[truth] * at
     store.run(1.0, shape=shape, spread=0.1 if truth != "undecided" else 0.5, **concrete(claim.cells))
     return store

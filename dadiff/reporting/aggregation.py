@@ -21,6 +21,7 @@ from dadiff.reporting.sources import Cell, Sweep
 from dadiff.reporting.statistics import bootstrap_weights
 
 RESAMPLES = 1000
+PRESETS = ("_fixed", "_unchecked")  # what they set is an axis of its own
 ALIASES = ("projector.initial_state",)  # stored as `initial_state`, too
 FIRST = ("task", "projector", "enforcement", "initial_state", "recording.length", "system.process_noise", "denoiser")
 LEVELS = ("robot", "case", "sample", "t")
@@ -90,7 +91,7 @@ class Evidence:
         """Every method of the sweep, in its order."""
         groups: dict[str, Method] = {}
         for cell in self.sweep.cells:
-            axes = {k: v for k, v in cell.axes.items() if v is not None and not is_seed(k) and k not in ALIASES}
+            axes = shared_axes(cell)
             method = groups.setdefault(repr(sorted(axes.items())), Method(axes, []))
             if cell.key not in [other.key for other in method.cells]:
                 method.cells.append(cell)
@@ -104,6 +105,14 @@ class Evidence:
         """What a method is compared to: the finished method that `against` asks for, alike in all else that applies."""
         found = [other for other in self.methods(against) if other.finished and _alike(method, other, against)]
         return found[0] if found else None
+
+
+def shared_axes(cell: Cell) -> dict[str, Any]:
+    """What a cell has in common with its replicates; presets such as `known_fixed` go by the projector they set."""
+    axes = {k: v for k, v in cell.axes.items() if v is not None and not is_seed(k) and k not in ALIASES}
+    for preset in PRESETS:
+        axes["projector"] = str(axes.get("projector")).removesuffix(preset)
+    return axes
 
 
 def is_seed(axis: str) -> bool:
@@ -134,24 +143,27 @@ def _same_draw(a: Cell, b: Cell) -> bool:
     return all(a.axes[name] in (b.axes[name], None) for name in shared)
 
 
-def case_means(cells: list[Cell], metric: str) -> np.ndarray:
+def case_means(cells: list[Cell], metric: str, group: str | None = None) -> np.ndarray:
     """Means over the plans of each case: (replicates, [robots,] cases[, T+1]).
 
     Metrics with one value a run come as (replicates,).
 
+    Args:
+        group: of a fleet, the robots of this group alone.
+
     Raises:
         StoreError: if a run has no such metric, rows are missing, or replicates differ in size.
     """
-    arrays = [_of_cell(cell, metric) for cell in cells]
+    arrays = [_of_cell(cell, metric, group) for cell in cells]
     shapes = sorted({array.shape for array in arrays})
     if len(shapes) > 1:
         raise StoreError(f"metric {metric}: replicates have shapes {shapes}; expected one; rerun with equal sizes")
     return np.stack(arrays)
 
 
-def case_scalars(cells: list[Cell], metric: str) -> np.ndarray:
+def case_scalars(cells: list[Cell], metric: str, group: str | None = None) -> np.ndarray:
     """As `case_means`, with metrics along time averaged over t: (replicates, [robots,] cases)."""
-    values = case_means(cells, metric)
+    values = case_means(cells, metric, group)
     if all(_table_with(cell, metric) == "per_step" for cell in cells):
         defined = ~np.isnan(values).all(axis=tuple(range(values.ndim - 1)))
         return values[..., defined].mean(axis=-1)
@@ -166,13 +178,20 @@ def _table_with(cell: Cell, metric: str) -> str | None:
     return None
 
 
-def _of_cell(cell: Cell, metric: str) -> np.ndarray:
+def _of_cell(cell: Cell, metric: str, group: str | None) -> np.ndarray:
     if name := _table_with(cell, metric):
         values = dense(cell.table(name), metric, where=f"run {cell.key}, {name}")
-        return values.mean(axis=-2 if name == "per_step" else -1)
+        means = values.mean(axis=-2 if name == "per_step" else -1)
+        return means if group is None else means[_robots_in(cell, group)]
     if metric not in cell.metrics:
         raise StoreError(f"run {cell.key} ({cell.name}): has no metric {metric!r}; found {', '.join(cell.metrics)}")
     return np.asarray(cell.metrics[metric], dtype=np.float64)
+
+
+def _robots_in(cell: Cell, group: str) -> np.ndarray:
+    if not cell.has("robots"):
+        raise StoreError(f"run {cell.key}: has no table of its robots, so none is of group {group}; run it again")
+    return (cell.table("robots")["group"] == group).to_numpy()
 
 
 def has_metric(cells: list[Cell], metric: str) -> bool:

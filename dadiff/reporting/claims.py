@@ -4,7 +4,7 @@ A claim names cells, a statistic and a rule. The statistic gives a finding for e
 where the finding's 95 % interval lies. The verdict follows from the findings alone, and so does its text:
 
     all true               holds
-    all false              does not hold
+    some false, none true  does not hold
     some true, some false  holds only if ...
     none false, some open  undecided
     nothing to test        not tested here
@@ -158,11 +158,9 @@ def _verdict(findings: list[Finding]) -> str:
     said = {finding.true for finding in findings}
     if not said:
         return "not tested here"
-    if {True, False} <= said:
-        return f"holds only if {_condition(findings)}"
-    if None in said:
-        return "undecided"
-    return "holds" if said == {True} else "does not hold"
+    if False in said:
+        return f"holds only if {_condition(findings)}" if True in said else "does not hold"
+    return "undecided" if None in said else "holds"
 
 
 def _condition(findings: list[Finding]) -> str:

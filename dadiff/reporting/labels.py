@@ -32,6 +32,8 @@ WORDS: dict[str, dict[str, str]] = {
 CHOICES = (*WORDS, "task", "sampler", "schedule", "training", "system")
 SYMBOLS = {
     "recording.length": "S",
+    "task.robots": "robots in training",
+    "dataset.train_size": "demonstrations",
     "training.steps": "gradient steps",
     "sampler.num_steps": "steps",
     "recording.process_noise": "σ_Γ",
@@ -44,6 +46,8 @@ METRICS = {
     "gap": "gap of plan and replay",
     "dynamics_residual": "dynamics residual",
     "initial_state_error": "error of x(0)",
+    "median_cost_ratio": "median cost / optimal cost",
+    "robots_served": "share of robots served",
     "cost_ratio": "cost / optimal cost",
     "principal_angle": "largest principal angle [rad]",
     "sampling_seconds": "sampling time [s]",

@@ -53,30 +53,49 @@ class Table:
         return [f"{row.label}: {row.outcome}" for row in self.rows if row.outcome]
 
 
-def collect(evidence: Evidence, *, cells: Selector, metrics: list[str], relative_to: Selector | None = None) -> Table:
-    """The methods that `cells` asks for; metrics that none of them has are left out."""
+def collect(
+    evidence: Evidence,
+    *,
+    cells: Selector,
+    metrics: list[str],
+    relative_to: Selector | None = None,
+    group: str | None = None,
+) -> Table:
+    """The methods that `cells` asks for; metrics that none of them has are left out.
+
+    Args:
+        relative_to: the baseline of ratios and differences.
+        group: of a fleet, the robots of this group alone.
+    """
     methods = evidence.methods(cells)
     kept = [name for name in metrics if any(m.finished and has_metric(m.finished, name) for m in methods)]
-    rows = [_row(evidence, method, kept, varying(methods), relative_to) for method in methods]
+    rows = [_row(evidence, method, kept, varying(methods), relative_to, group) for method in methods]
     return Table(kept, method_name(dict(relative_to)) if relative_to else "", rows)
 
 
-def _row(evidence: Evidence, method: Method, metrics: list[str], shown: list[str], baseline: Selector | None) -> Row:
+def _row(
+    evidence: Evidence,
+    method: Method,
+    metrics: list[str],
+    shown: list[str],
+    baseline: Selector | None,
+    group: str | None,
+) -> Row:
     values: dict[str, Value | None] = {}
     other = evidence.partner(method, baseline) if baseline and method.finished else None
     for metric in metrics:
         there = method.finished and has_metric(method.finished, metric)
-        values[metric] = _value(method, other, metric) if there else None
+        values[metric] = _value(method, other, metric, group) if there else None
     return Row(method_name(method.axes, shown), values, method.outcome, method.counts(), method.keys)
 
 
-def _value(method: Method, other: Method | None, metric: str) -> Value:
-    values = case_scalars(method.finished, metric)
+def _value(method: Method, other: Method | None, metric: str, group: str | None) -> Value:
+    values = case_scalars(method.finished, metric, group)
     weights = weights_for(values.shape)
     average, middle = mean(values, weights), interquartile_mean(values, weights)
     if other is None or other is method or not has_metric(other.finished, metric):
         return Value(average, middle, None, None)
-    own, theirs = (case_scalars(cells, metric) for cells in pair(method, other))
+    own, theirs = (case_scalars(cells, metric, group) for cells in pair(method, other))
     weights = weights_for(own.shape)
     return Value(average, middle, ratio(own, theirs, weights), difference(own, theirs, weights))
 

@@ -65,6 +65,7 @@ def lengths() -> None:
             for projector, level in (("hankel", 1 - 30 / length), ("hankel_lowrank", 0.1 + 10 / length)):
                 store.run(level, projector=projector, enforcement="normalised", denoiser="gaussian",
                           recording__length=length, recording__seed=recording, system__process_noise=0.01,
+                          recording__process_noise=0.01,
                           metrics={"principal_angle": level / 3, "projector_distance": level / 2})  # fmt: skip
     store.sweep()
 
@@ -87,6 +88,7 @@ def fleet() -> None:
     store = MadeUp(STORE, "fleet_made_up", cases=4, samples=1, horizon=6)
     robots = np.geomspace(0.3, 3, 8)
     arrays = {k: np.stack([v] * 3) for k, v in example_arrays(6, 0.5).items() if not k.startswith(("chain", "noised"))}
+    arrays["robots"] = np.array([0, 3, 7])
     for enforcement, initial_state, level in (
         ("post_hoc", "free", 0.5),
         ("normalised", "free", 0.1),

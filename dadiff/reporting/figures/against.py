@@ -98,7 +98,7 @@ def collect(
     levels: Selector | None = None,
     marked: dict[str, float] | None = None,
 ) -> Against:
-    """Methods of `cells` over `axis`.
+    """Methods of `cells` over `axis`, those with two values of it or more.
 
     Args:
         by: an axis with a panel for each of its values.
@@ -116,7 +116,8 @@ def collect(
     def panel(metric: str, value: Any) -> Panel:
         here = [m for m in used if has_metric(m.finished, metric) and (by is None or m.axes.get(by) == value)]
         beside = [m for m in flat if has_metric(m.finished, metric) and (by is None or m.axes.get(by) in (value, None))]
-        lines = [_line(evidence, group, axis, metric, shown, relative_to) for group in _lines(here, axis)]
+        groups = [group for group in _lines(here, axis) if len(group) > 1]
+        lines = [_line(evidence, group, axis, metric, shown, relative_to) for group in groups]
         return Panel(axis_value(by, value) if by else "", metric, lines, [_level(m, metric) for m in beside])
 
     every = [p for p in (panel(metric, value) for metric in metrics for value in values) if p.lines]

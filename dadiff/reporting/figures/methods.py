@@ -85,26 +85,33 @@ def shortened(text: str, most: int = 30) -> str:
 
 
 def collect(
-    evidence: Evidence, *, metrics: list[str], cells: Selector, log: bool = True, best: dict[str, float] | None = None
+    evidence: Evidence,
+    *,
+    metrics: list[str],
+    cells: Selector,
+    log: bool = True,
+    best: dict[str, float] | None = None,
+    group: str | None = None,
 ) -> Methods:
     """The methods that `cells` asks for, diverged ones named in their place.
 
     Args:
+        group: of a fleet, the robots of this group alone.
         best: metric -> where a dotted line marks what cannot be bettered.
     """
     methods = evidence.methods(cells)
     shown, alive = varying(methods), [method for method in methods if method.finished]
-    rows = [[_row(method, metric, shown) for method in methods] for metric in metrics] if alive else []
+    rows = [[_row(method, metric, shown, group) for method in methods] for metric in metrics] if alive else []
     robots = any("robots" in method.counts() for method in alive)
     notes = [f"{method_name(m.axes, shown)}: {m.outcome}" for m in methods if m.lost]
     return Methods(metrics if alive else [], rows, "robot" if robots else "case", log, best or {},
                    [key for m in alive for key in m.keys], notes)  # fmt: skip
 
 
-def _row(method: Method, metric: str, shown: list[str]) -> Row:
+def _row(method: Method, metric: str, shown: list[str], group: str | None) -> Row:
     label = method_name(method.axes, shown)
     if not method.finished:
         return Row(label, method.axes, None, np.empty(0), method.outcome)
-    values = case_scalars(method.finished, metric)
+    values = case_scalars(method.finished, metric, group)
     dots = np.nanmean(values, axis=-1) if values.ndim > 2 else values
     return Row(label, method.axes, mean(values, weights_for(values.shape)), dots.ravel(), "")

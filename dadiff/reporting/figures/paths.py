@@ -134,7 +134,7 @@ def collect(
     for robot in rows if used else []:
         scene, optimum = _scene(used[0], robot, case)
         paths = [_path(method, robot, case, shown, replay=apart) for method in used]
-        title = "plans" if robot is None else f"robot {robot}"
+        title = "plans" if robot is None else f"robot {used[0].finished[0].examples['robots'][robot]}"
         if sample_of_data:
             drawn.append(Panel("a sample of the data", scene, optimum, []))
         if apart:
@@ -143,7 +143,7 @@ def collect(
             ]
         else:
             drawn.append(Panel(title, scene, optimum, paths))
-    across = len(used) if apart else 2
+    across = min(len(used), 4) if apart else 2
     notes = [f"{method_name(m.axes, shown)}: {m.outcome}" for m in methods if m.lost]
     return Paths(drawn, across, [m.finished[0].key for m in used], notes)
 

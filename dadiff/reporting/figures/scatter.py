@@ -37,13 +37,15 @@ class Scatter:
 
     def draw(self, columns: int) -> Figure:
         """One panel with both axes logarithmic."""
-        figure, (ax,) = panels(
-            1, columns, width=5.2 if columns > 1 else PANEL_WIDTH, height=3.3 + 0.1 * len(self.points)
-        )
+        width = 6.6 if columns > 1 else PANEL_WIDTH
+        figure, (ax,) = panels(1, columns, width=width, height=3.1 + 0.18 * len(self.points) / min(columns, 2))
         for point, look in zip(self.points, looks_of([point.axes for point in self.points]), strict=True):
             bars = [[[e.value - e.low], [e.high - e.value]] for e in (point.x, point.y)]
             ax.errorbar(point.x.value, point.y.value, bars[1], bars[0], fmt="none", color=look.colour, capsize=2, lw=1)
             ax.plot(point.x.value, point.y.value, ls="", ms=7, label=point.label, **look.points)
+        if self.diagonal:
+            ends = [end([e.value for p in self.points for e in (p.x, p.y)]) for end in (min, max)]
+            ax.plot(ends, ends, color="#888888", lw=0.8, ls=":", zorder=0)
         log_axis(ax, "x")
         log_axis(ax, "y")
         ax.set_xlabel(metric_name(self.x))
