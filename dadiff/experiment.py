@@ -207,7 +207,7 @@ def examples(experiment: Experiment, plans: Plans) -> dict[str, np.ndarray]:
     steps, chain = plans.snapshots.stacked()
     states, inputs = layout.split(planned)
     reference_states, reference_inputs = layout.split(reference)
-    noised = _noised(experiment, cases.reference[plans.snapshots.plan[:-1] + (0,)], steps)
+    noised = _noised(experiment, cases.reference[(*plans.snapshots.plan[:-1], 0)], steps)
     return {
         "states": states,
         "inputs": inputs,
