@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import os
-import pwd
 import shutil
 import socket
 import subprocess
 import sys
+import tempfile
 import time
 import urllib.error
 import urllib.request
@@ -62,26 +62,24 @@ class Server:
 
 
 @contextmanager
-def postgresql(folder: Path) -> Iterator[str]:
+def postgresql() -> Iterator[str]:
     """A PostgreSQL cluster of its own; yields the uri of an empty database."""
     binaries = postgresql_binaries()
     if binaries is None:
         raise RuntimeError("PostgreSQL is not installed")
-    port, data = free_port(), folder / "postgresql"
-    demote = {}
-    if os.getuid() == 0:  # PostgreSQL refuses to run as root
-        shutil.chown(folder, "postgres")
-        for parent in (folder, *folder.parents[:3]):
-            parent.chmod(parent.stat().st_mode | 0o055)
-        demote = {"user": pwd.getpwnam("postgres").pw_uid}
-    options = f"-p {port} -k {folder} -c listen_addresses=127.0.0.1 -c fsync=off"
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "cwd": "/", **demote}
-    subprocess.run([binaries / "initdb", "-A", "trust", "-U", "dadiff", data], check=True, **quiet)
-    subprocess.run([binaries / "pg_ctl", "-D", data, "-w", "-o", options, "start"], check=True, **quiet)
-    try:
-        yield f"postgresql://dadiff@127.0.0.1:{port}/postgres"
-    finally:
-        subprocess.run([binaries / "pg_ctl", "-D", data, "-m", "immediate", "stop"], check=True, **quiet)
+    with tempfile.TemporaryDirectory() as folder:
+        port, data, demote = free_port(), Path(folder) / "data", {}
+        if os.getuid() == 0:  # PostgreSQL refuses to run as root
+            shutil.chown(folder, "postgres")
+            demote = {"user": "postgres"}
+        options = f"-p {port} -k {folder} -c listen_addresses=127.0.0.1 -c fsync=off"
+        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "cwd": "/", "check": True, **demote}
+        subprocess.run([binaries / "initdb", "-A", "trust", "-U", "dadiff", data], **quiet)
+        subprocess.run([binaries / "pg_ctl", "-D", data, "-w", "-o", options, "start"], **quiet)
+        try:
+            yield f"postgresql+psycopg2://dadiff@127.0.0.1:{port}/postgres"
+        finally:
+            subprocess.run([binaries / "pg_ctl", "-D", data, "-m", "immediate", "stop"], **quiet)
 
 
 def postgresql_binaries() -> Path | None:

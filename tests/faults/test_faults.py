@@ -40,7 +40,8 @@ def open_at_once(root: Path, number: int, ready) -> None:
 
 @pytest.mark.parametrize("attempt", range(20))
 def test_eight_processes_may_open_a_store_that_does_not_exist(attempt, tmp_path):
-    context = multiprocessing.get_context("spawn" if attempt == 0 else "forkserver")
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["mlflow.store.tracking.sqlalchemy_store", "mlflow.tracking.client"])
     ready = context.Barrier(8)
     workers = [context.Process(target=open_at_once, args=(tmp_path, n, ready)) for n in range(8)]
     for worker in workers:
@@ -102,7 +103,7 @@ def trained(root: Path) -> bool:
 @pytest.mark.skipif(postgresql_binaries() is None, reason="PostgreSQL is not installed (Debian: postgresql)")
 @pytest.mark.skipif(importlib.util.find_spec("psycopg2") is None, reason="psycopg2 is not installed")
 def test_a_server_over_postgresql_works_the_same(undisturbed, tmp_path):
-    with postgresql(tmp_path) as backend:
+    with postgresql() as backend:
         server = Server(tmp_path, backend)
         server.start()
         try:
