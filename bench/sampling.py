@@ -1,6 +1,6 @@
 """How fast data are drawn and plans sampled, and what projecting adds to it.
 
-    python -m bench.sampling
+python -m bench.sampling
 """
 
 from __future__ import annotations

@@ -95,10 +95,10 @@ class Experiment:
     @cached_property
     def denoiser(self) -> Any:
         """The exact denoiser, or the trained one from the cache or trained now."""
-        recipe, schedule = self.parts["denoiser"], self.parts["schedule"]
-        if not recipe.trainable:
+        recipe, schedule, artefact = self.parts["denoiser"], self.parts["schedule"], self.identity.denoiser
+        if artefact is None:
             return recipe.exact(self._law(), self.coordinates, schedule, self.device)
-        folder = self._cached(self.identity.denoiser, self._train, resumable=True)
+        folder = self._cached(artefact, self._train, resumable=True)
         environment_dim = self.cases.environment.shape[-1]
         return load(folder / "model.safetensors", recipe, self.layout, environment_dim, schedule).to(self.device)
 

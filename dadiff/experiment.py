@@ -1,7 +1,7 @@
 """One run, from configuration to stored result: the place where all rooms meet.
 
-    prepare   builds what the run shares with others: the data set and the trained denoiser
-    execute   samples plans for every test case, evaluates them, and stores the result whole
+prepare   builds what the run shares with others: the data set and the trained denoiser
+execute   samples plans for every test case, evaluates them, and stores the result whole
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import yaml
 
 from dadiff.assembly import Experiment
 from dadiff.diffusion.chain import Samples, sample
+from dadiff.diffusion.enforcement import Enforcement
 from dadiff.errors import ConfigError
 from dadiff.evaluation import replay, tracking_errors
 from dadiff.evaluation.mahalanobis import MahalanobisDistance
@@ -35,16 +36,16 @@ EXAMPLE_ROBOTS = 3
 
 @dataclass
 class Timed:
-    """A projection that counts its calls and the seconds they take."""
+    """A function that counts its calls and the seconds they take."""
 
-    project: Callable[[torch.Tensor], torch.Tensor]
+    function: Callable[..., Any]
     calls: int = 0
     seconds: float = 0.0
 
-    def __call__(self, tau: torch.Tensor) -> torch.Tensor:
-        """Project."""
+    def __call__(self, *arguments: Any) -> Any:
+        """Call it."""
         start = time.perf_counter()
-        result = self.project(tau)
+        result = self.function(*arguments)
         self.seconds += time.perf_counter() - start
         self.calls += 1
         return result
@@ -105,35 +106,36 @@ def projection_of(experiment: Experiment, x_init: np.ndarray) -> tuple[Projectio
 
 def draw_plans(experiment: Experiment) -> Plans:
     """Sample plans for every case, with the same noise whatever the projector."""
-    _check_enforcement(experiment)
     parts, cases = experiment.parts, experiment.cases
     evaluation, schedule = parts["evaluation"], parts["schedule"]
     environment = np.repeat(cases.environment, evaluation.samples, axis=-2)
     projection, measures = projection_of(experiment, np.repeat(cases.x_init, evaluation.samples, axis=-2))
+    _check_enforcement(parts["enforcement"], projection)
     project = Timed(projection.map(lambda a: torch.as_tensor(a, device=experiment.device))) if projection else None
     denoiser = experiment.denoiser  # after the projection, which may refuse what it is given
     chain, snapshots = _observers(experiment, environment)
+    watch = Timed(lambda *seen: [observe(*seen) for observe in (chain, snapshots) if observe])
     shape = (*environment.shape[:-1], experiment.layout.size)
     start = time.perf_counter()
     samples = sample(
         parts["sampler"], schedule, denoiser, torch.as_tensor(environment, device=experiment.device), shape,
         torch_generator(evaluation.seed, "sampling noise"), project, parts["enforcement"],
-        lambda j, stage, tau: [see(j, stage, tau) for see in (chain, snapshots) if see],
+        watch,
         evaluation.divergence_bound, parts.settings.progress,
     )  # fmt: skip
-    measures |= {"sampling_seconds": time.perf_counter() - start, "network_calls": samples.network_calls}
+    elapsed = time.perf_counter() - start - watch.seconds
+    measures |= {"sampling_seconds": elapsed, "network_calls": samples.network_calls}
     if project and project.calls:
         measures |= {"projection_seconds": project.seconds / project.calls, "projection_calls": project.calls}
     tau = samples.tau.cpu().numpy().reshape(*cases.environment.shape[:-1], evaluation.samples, -1)
     return Plans(experiment.coordinates.to_physical(tau), samples, measures, chain, snapshots)
 
 
-def _check_enforcement(experiment: Experiment) -> None:
-    parts = experiment.parts
-    if getattr(parts["projector"], "initial_state", "free") == "fixed" and not parts["enforcement"].affine:
+def _check_enforcement(enforcement: Enforcement, projection: Projection | None) -> None:
+    if projection is not None and np.any(projection.offset) and not enforcement.affine:
         raise ConfigError(
-            "enforcement: literal scales the sample, which is meaningless for the affine set of x(0) = x_init; "
-            "use projector.initial_state=free or another enforcement"
+            "enforcement: literal scales the sample, which is meaningless for an affine set (x(0) held, or coordinates "
+            "with a mean); use projector.initial_state=free and coordinates=physical, or another enforcement"
         )
 
 
@@ -151,7 +153,7 @@ def _observers(experiment: Experiment, environment: np.ndarray) -> tuple[ChainRe
 def _store(experiment: Experiment, config: Mapping[str, Any], plans: Plans, started: float) -> StoredRun:
     """Evaluate and write. Of a diverged chain nothing but where it diverged, and how its distance went."""
     identity, diverged_at = experiment.identity, plans.samples.diverged_at
-    artefacts = (identity.demonstrations, identity.cases, identity.denoiser)
+    artefacts = (identity.demonstrations, identity.cases, identity.denoiser, identity.recording)
     record = {
         "key": identity.key,
         "name": identity.name,

@@ -22,7 +22,7 @@ FORMAT = 1  # raised whenever a change moves results; see CHANGELOG
 
 @dataclass(frozen=True)
 class Artefact:
-    """A cached thing: its kind ("demonstrations", "cases", "denoiser", ...), what determines it, and the hash of that."""
+    """A cached thing: its kind ("demonstrations", "cases", "denoiser"), what determines it, and the hash of that."""
 
     kind: str
     determined_by: dict[str, Any]

@@ -9,10 +9,8 @@ from pathlib import Path
 import pytest
 
 README = (Path(__file__).parent.parent / "README.md").read_text()
-SMALL = (
-    "dataset.train_size=40 dataset.test_size=2 evaluation.samples=1 schedule.num_steps=30 training.steps=3 "
-    "training.warmup=0 sampler.skip_below=0 progress=false"
-).split()
+SMALL = ["dataset.train_size=40", "dataset.test_size=2", "evaluation.samples=1", "schedule.num_steps=30"]
+SMALL += ["training.steps=3", "training.warmup=0", "sampler.skip_below=0", "progress=false"]
 
 
 def blocks(language: str) -> list[str]:
@@ -27,7 +25,9 @@ EXAMPLES = [block for block in blocks("python") if "class " not in block]
 def dadiff(arguments: list[str], folder: Path) -> subprocess.CompletedProcess:
     environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(folder)}
     command = [sys.executable, "-m", "dadiff", *arguments]
-    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=250, check=False)
+    return subprocess.run(
+        command, cwd=folder, env=environment, capture_output=True, text=True, timeout=250, check=False
+    )
 
 
 @pytest.mark.parametrize("arguments", COMMANDS, ids=" ".join)

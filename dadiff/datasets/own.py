@@ -52,5 +52,7 @@ class OwnEnvironments:
     def test(self, task: Task, system: LinearSystem) -> Cases:
         """The file's environments, with the expert's solutions as references."""
         if not isinstance(task, Obstacles):
-            raise ConfigError("dataset: environments are planned for by task=obstacles; use dataset=npz for other tasks")
+            raise ConfigError(
+                "dataset: environments are planned for by task=obstacles; use dataset=npz for other tasks"
+            )
         return task.solve(system, load_environments(self.path, task, time_step_of(system)))

@@ -81,9 +81,9 @@ def _columns(table: pd.DataFrame, index: str, prefix: str = "") -> list[tuple[st
     quantities = [name for name in table.columns if name not in INDICES]
     means = table.groupby(index)[quantities].mean()
     return [
-        (f"{prefix}{name}", float(value), int(step))
+        (f"{prefix}{name}", value, step)
         for name in quantities
-        for step, value in means[name].items()
+        for step, value in zip(means.index.tolist(), means[name].tolist(), strict=True)
         if math.isfinite(value)
     ]
 
