@@ -97,6 +97,7 @@ def test_lost_and_double_cells_are_named_and_never_averaged(report):
     assert len(lost) == 3
     for part in (*content["tables"].values(), *content["figures"].values()):
         assert not lost & set(part["runs"])
+    assert {cell["outcome"] for cell in content["cells"] if cell["status"] == "finished"} == {"finished"}
     assert [len(group) for group in content["duplicates"]] == [2]
 
 

@@ -146,6 +146,6 @@ def _read(output_dir: Path, name: str) -> Sweep:
     stored, cells = sweeps.read(name), []
     for cell in stored.cells:
         run = results.read(cell.key) if results.status(cell.key) else None
-        waiting = cell.reason or (cell.status if cell.status != "waiting" else None)
+        waiting = None if run else cell.reason or (cell.status if cell.status != "waiting" else None)
         cells.append(Cell(cell.key, cell.name, {**cell.axes, **(run.axes if run else {})}, run, waiting))
     return Sweep(stored.name, stored.command, cells)

@@ -37,7 +37,7 @@ class Robots:
         """One panel a metric, every marker a robot."""
         figure, axes = panels(len(self.metrics), columns)
         for index, (ax, metric) in enumerate(zip(axes, self.metrics, strict=True)):
-            for points, look in zip(self.points, looks_of([p.axes for p in self.points]), strict=True):
+            for points, look in zip(self.points, looks_of([p.axes for p in self.points], lines=False), strict=True):
                 ax.plot(points.distance, points.values[index], ls="", ms=3.5, label=points.label, **look.points)
             log_axis(ax, "y")
             ax.set_title(metric_name(metric))

@@ -39,7 +39,7 @@ class Scatter:
         """One panel with both axes logarithmic."""
         width = 6.6 if columns > 1 else PANEL_WIDTH
         figure, (ax,) = panels(1, columns, width=width, height=3.1 + 0.18 * len(self.points) / min(columns, 2))
-        for point, look in zip(self.points, looks_of([point.axes for point in self.points]), strict=True):
+        for point, look in zip(self.points, looks_of([point.axes for point in self.points], lines=False), strict=True):
             bars = [[[e.value - e.low], [e.high - e.value]] for e in (point.x, point.y)]
             ax.errorbar(point.x.value, point.y.value, bars[1], bars[0], fmt="none", color=look.colour, capsize=2, lw=1)
             ax.plot(point.x.value, point.y.value, ls="", ms=7, label=point.label, **look.points)

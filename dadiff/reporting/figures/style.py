@@ -10,7 +10,7 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol
 
 import matplotlib
@@ -92,16 +92,18 @@ def look_of(axes: Mapping[str, Any]) -> Look:
     )
 
 
-def looks_of(methods: Sequence[Mapping[str, Any]]) -> list[Look]:
-    """As `look_of`; methods that would look alike get other lines and half filled markers, in their order."""
+def looks_of(methods: Sequence[Mapping[str, Any]], *, lines: bool = True) -> list[Look]:
+    """As `look_of`; methods that would look alike get other lines and half filled markers, in their order.
+
+    Args:
+        lines: False where only markers are drawn, so that lines tell nothing apart.
+    """
+    plain = [look_of(axes) if lines else replace(look_of(axes), line="-") for axes in methods]
     looks: list[Look] = []
-    for axes in methods:
-        look = look_of(axes)
-        variant = sum(other == look for other in map(look_of, methods[: len(looks)]))
-        if variant:
-            line, fill = VARIANTS[(variant - 1) % len(VARIANTS)]
-            look = Look(look.colour, look.marker, line, fill)
-        looks.append(look)
+    for index, look in enumerate(plain):
+        variant = plain[:index].count(look)
+        line, fill = VARIANTS[(variant - 1) % len(VARIANTS)] if variant else (look.line, look.fill)
+        looks.append(replace(look, line=line, fill=fill))
     return looks
 
 
