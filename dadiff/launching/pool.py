@@ -30,6 +30,8 @@ GRACE_SECONDS = 5.0
 TICK_SECONDS = 0.2
 THREAD_LIMITS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 
+QUIET = {"PYTHONWARNINGS": "ignore:resource_tracker"}  # which warns of the locks of every job that was ended
+
 
 @dataclass(frozen=True)
 class Work:
@@ -170,8 +172,9 @@ def _start_server(threads: int) -> None:
     """Start the server that jobs are forked from; it inherits the limits on threads of its environment."""
     from multiprocessing import forkserver
 
-    before = {name: os.environ.get(name) for name in THREAD_LIMITS}
-    os.environ.update(dict.fromkeys(THREAD_LIMITS, str(threads)))
+    wanted = {**dict.fromkeys(THREAD_LIMITS, str(threads)), **QUIET}
+    before = {name: os.environ.get(name) for name in wanted}
+    os.environ.update(wanted)
     forkserver.ensure_running()
     for name, value in before.items():
         if value is None:
