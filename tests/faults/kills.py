@@ -37,7 +37,7 @@ PLACES = {
     "job: tables written, record not": "dadiff.store.results:write_json:before",
     "job: result written, not in its place": "dadiff.store.results:_replace:before",
     "job: result in its place": "dadiff.store.results:_replace:after",
-    "job: sent by the system": "dadiff.experiment:evaluate:before",
+    "job: before its plans are evaluated": "dadiff.experiment:evaluate:before",
     "trainer: before it trains": "dadiff.assembly:train:before",
     "trainer: before a checkpoint": "dadiff.denoisers.learning:State.store:before",
     "trainer: after a checkpoint": "dadiff.denoisers.learning:State.store:after",
