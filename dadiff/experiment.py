@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import torch
 import yaml
 
@@ -28,7 +27,7 @@ from dadiff.provenance import provenance
 from dadiff.randomness import numpy_generator, torch_generator
 from dadiff.store import StoredRun
 from dadiff.systems import LinearSystem, Robots
-from dadiff.tasks import Fleet, Scores
+from dadiff.tasks import Scores
 from dadiff.trajectory.subspace import largest_angle, projector_distance
 
 EXAMPLE_ROBOTS = 3
@@ -172,12 +171,8 @@ def _store(experiment: Experiment, config: Mapping[str, Any], plans: Plans, star
     arrays = {}
     if diverged_at is None:
         scores = evaluate(experiment, plans.planned)
-        metrics = {**headline(scores), **plans.measures}
         written |= tables(scores)
-        if isinstance(task := experiment.parts["task"], Fleet):
-            metrics |= task.headline(scores)
-            written["robots"] = pd.DataFrame(task.robot_table(experiment.parts["system"]))
-        record["metrics"] = metrics
+        record["metrics"] = {**headline(scores), **plans.measures}
         arrays = examples(experiment, plans)
     text = yaml.safe_dump(dict(config), sort_keys=False)
     return experiment.results.write(record, config_text=text, tables=written, arrays=arrays)

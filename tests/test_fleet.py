@@ -32,7 +32,7 @@ from dadiff.systems import (
 )
 from dadiff.systems.families import Ranges
 from dadiff.tasks import LQR, Fleet
-from dadiff.tasks.fleet import transitions
+from dadiff.tasks.fleet import robot_table, transitions
 
 CONF = Path(__file__).parents[1] / "conf"
 FAMILIES = [DampedIntegrators(), RotatedIntegrators(), LaggedIntegrators()]
@@ -147,7 +147,7 @@ class TestTask:
         np.testing.assert_array_equal(only.reference[0], cases.reference[3])
         tau = Generated(5, 4).train(one, self.family).trajectories
         assert tau.shape[0] == 5
-        assert one.robot_table(self.family)["group"].tolist() == ["extrapolation"]
+        assert robot_table(one.target(self.family))["group"].tolist() == ["extrapolation"]
 
     @pytest.mark.parametrize("told", ["nothing", "robot_parameters", "recording"])
     def test_the_condition_has_the_stated_length(self, told, rng):
@@ -170,7 +170,7 @@ class TestTask:
             np.testing.assert_allclose(told[k, :, 8:], 0.1 * (b * told[k, :, 4:6] - c * told[k, :, 2:4]), atol=1e-12)
 
     def test_groups_follow_from_the_distance(self):
-        table = fleet_for(self.family).robot_table(self.family)
+        table = robot_table(fleet_for(self.family).target(self.family))
         assert table["group"].tolist() == ["interpolation"] * 3 + ["extrapolation"] * 2
         assert ((table["distance"] > 0) == (table["group"] == "extrapolation")).all()
 

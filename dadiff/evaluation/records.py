@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections import ChainMap
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
 import numpy as np
@@ -19,9 +20,8 @@ SHOWN_SIGNAL = (0.0, 0.05, 0.25, 0.5, 0.75, 0.95, 1.0)
 
 def merged(*scores: Scores) -> Scores:
     """All scores in one."""
-    return Scores(
-        {k: v for s in scores for k, v in s.per_plan.items()}, {k: v for s in scores for k, v in s.per_step.items()}
-    )
+    parts = {field.name: [getattr(score, field.name) for score in scores] for field in fields(Scores)}
+    return Scores(**{name: dict(ChainMap(*values)) for name, values in parts.items()})
 
 
 def long_table(values: dict[str, np.ndarray], axes: tuple[str, ...]) -> pd.DataFrame:
@@ -34,8 +34,9 @@ def long_table(values: dict[str, np.ndarray], axes: tuple[str, ...]) -> pd.DataF
 
 
 def tables(scores: Scores) -> dict[str, pd.DataFrame]:
-    """`per_step` and `per_plan`."""
+    """`per_step`, `per_plan` and the task's own tables."""
     return {
+        **{name: pd.DataFrame(columns) for name, columns in scores.tables.items()},
         "per_step": long_table(scores.per_step, ("case", "sample", "t")),
         "per_plan": long_table(scores.per_plan, ("case", "sample")),
     }
@@ -43,7 +44,8 @@ def tables(scores: Scores) -> dict[str, pd.DataFrame]:
 
 def headline(scores: Scores) -> dict[str, float]:
     """The mean of every score over robots, cases, samples and time, leaving out where it is not defined."""
-    return {name: float(np.nanmean(values)) for name, values in {**scores.per_step, **scores.per_plan}.items()}
+    defined = {name: v[~np.isnan(v)] for name, v in {**scores.per_step, **scores.per_plan}.items()}
+    return {name: float(v.mean()) if v.size else float("nan") for name, v in defined.items()} | scores.headline
 
 
 @dataclass

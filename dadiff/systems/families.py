@@ -22,9 +22,11 @@ class Robots(LinearSystem):
 
     Args:
         parameters: name -> (robots,).
+        distance: how far each lies outside of its family's ranges, in their widths, (robots,); see `Ranges.distance`.
     """
 
     parameters: Mapping[str, np.ndarray] = field(default_factory=dict, repr=False)
+    distance: np.ndarray = field(default_factory=lambda: np.zeros(0), repr=False)
 
     @property
     def parameter_table(self) -> np.ndarray:
@@ -34,7 +36,7 @@ class Robots(LinearSystem):
     def take(self, index: Sequence[int] | np.ndarray) -> Robots:
         """The robots at `index`."""
         parameters = {name: values[index] for name, values in self.parameters.items()}
-        return Robots(self.A[index], self.B[index], self.process_noise, parameters)
+        return Robots(self.A[index], self.B[index], self.process_noise, parameters, self.distance[index])
 
     def most_different(self, count: int) -> np.ndarray:
         """Indices of at most `count` robots: the one farthest out, then each as far as possible from those before."""
@@ -134,7 +136,7 @@ class Family(ABC):
     def robots(self, values: np.ndarray) -> Robots:
         """The robots with parameters (robots, p)."""
         columns = dict(zip(self.ranges.bounds, np.moveaxis(values, -1, 0), strict=True))
-        return Robots(*self.dynamics(*columns.values()), self.process_noise, columns)
+        return Robots(*self.dynamics(*columns.values()), self.process_noise, columns, self.ranges.distance(values))
 
     def inside(self, count: int, rng: np.random.Generator) -> Robots:
         """`count` robots drawn uniformly from the ranges."""

@@ -115,25 +115,15 @@ class Fleet:
         return Cases(condition, environment[..., : system.state_dim], reference)
 
     def score(self, system: Robots, cases: Cases, planned: np.ndarray, rollout: np.ndarray) -> Scores:
-        """The cost after replay, relative to each robot's own optimum."""
+        """The cost after replay, relative to each robot's own optimum.
+
+        In the headline, of the robots' mean cost ratios: their median, and the share within 5 % of the optimum.
+        """
         ends = replace(cases, environment=cases.environment[..., : 2 * system.state_dim])
-        return self.lqr.score(system, ends, planned, rollout)
-
-    def robot_table(self, system: Family) -> dict[str, np.ndarray]:
-        """Per test robot: its group, its distance from the training ranges (in their widths), its parameters."""
-        robots = self.target(system)
-        distance = system.ranges.distance(robots.parameter_table)
-        return {
-            "robot": np.arange(len(distance)),
-            "group": np.where(distance > 0, "extrapolation", "interpolation"),
-            "distance": distance,
-            **robots.parameters,
-        }
-
-    def headline(self, scores: Scores) -> dict[str, float]:
-        """Of the robots' mean cost ratios: their median, and the share within 5 % of the optimum."""
+        scores = self.lqr.score(system, ends, planned, rollout)
         ratio = scores.per_plan["cost_ratio"].mean(axis=(-2, -1))
-        return {"median_cost_ratio": float(np.median(ratio)), "robots_served": float((ratio <= SERVED).mean())}
+        headline = {"median_cost_ratio": float(np.median(ratio)), "robots_served": float((ratio <= SERVED).mean())}
+        return replace(scores, headline=headline, tables={"robots": robot_table(system)})
 
     def _condition(self, environment: np.ndarray, robots: Robots, count: int, rng: np.random.Generator) -> np.ndarray:
         """E with what is told of the robot; `count` recordings a robot, one for each environment or one for all."""
@@ -145,6 +135,16 @@ class Fleet:
             excitation = GaussianExcitation(self.recording_length, count=count, seed=int(rng.integers(2**31)))
             told = transitions(excitation.record(robots))
         return np.concatenate([environment, np.broadcast_to(told, (*environment.shape[:-1], told.shape[-1]))], axis=-1)
+
+
+def robot_table(robots: Robots) -> dict[str, np.ndarray]:
+    """Per robot: its group, its distance from the training ranges (in their widths), its parameters."""
+    return {
+        "robot": np.arange(len(robots.distance)),
+        "group": np.where(robots.distance > 0, "extrapolation", "interpolation"),
+        "distance": robots.distance,
+        **robots.parameters,
+    }
 
 
 def transitions(recording: Recording) -> np.ndarray:

@@ -53,10 +53,14 @@ class Scores:
     Args:
         per_plan: name -> (*robots, cases, samples).
         per_step: name -> (*robots, cases, samples, T+1); nan where a quantity is not defined at T.
+        headline: name -> one number, beside the means of the above.
+        tables: name -> columns, for what is neither a plan's nor a step's.
     """
 
     per_plan: dict[str, np.ndarray] = field(default_factory=dict)
     per_step: dict[str, np.ndarray] = field(default_factory=dict)
+    headline: dict[str, float] = field(default_factory=dict)
+    tables: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
 
 
 class Task(Protocol):
