@@ -6,6 +6,7 @@ import io
 import os
 import signal
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -45,6 +46,14 @@ def multiply(path: Path) -> None:
 
     size = float((torch.ones(400, 400) @ torch.ones(400, 400)).sum())
     path.write_text(f"{size:.0f} {torch.get_num_threads()} {os.environ['OMP_NUM_THREADS']}")
+
+
+def threads_and_times() -> None:
+    import torch
+
+    begun = time.time()
+    time.sleep(0.3)
+    os.write(1, f"{torch.get_num_threads()} {begun} {time.time()}".encode())
 
 
 class Silent:
@@ -182,3 +191,15 @@ def test_the_last_line_of_a_log_is_its_progress(tmp_path):
     log.write_text("start\nsampling:  10%|#\rsampling:  42%|####  \x1b[A")
     assert last_line(log).startswith("sampling:  42%|####")
     assert [clock(s) for s in (7.31, 245, 7800)] == ["7.3 s", "4:05", "2:10:00"]
+
+
+def test_work_that_is_alone_waits_for_the_rest_and_has_every_thread(tmp_path):
+    crowd = [work(tmp_path, key, threads_and_times) for key in "ab"]
+    alone = replace(work(tmp_path, "c", threads_and_times), alone=True)
+    after = [work(tmp_path, key, threads_and_times) for key in "de"]
+    Pool(workers=2, threads=1, preload=["torch"]).run([*crowd, alone, *after], Silent())
+    seen = {key: (tmp_path / "logs" / f"{key}.log").read_text().split() for key in "abcde"}
+    assert {key: int(words[0]) for key, words in seen.items()} == {"a": 1, "b": 1, "c": 2, "d": 1, "e": 1}
+    begun, ended = ({key: float(words[k]) for key, words in seen.items()} for k in (1, 2))
+    assert max(ended["a"], ended["b"]) <= begun["c"]
+    assert ended["c"] <= min(begun["d"], begun["e"])

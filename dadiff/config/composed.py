@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
@@ -15,14 +16,17 @@ from dadiff.errors import ConfigError
 def plain(config: DictConfig, choices: Mapping[str, str]) -> dict[str, Any]:
     """The resolved configuration without Hydra's own node, with the chosen preset of each group under `choices`.
 
+    The output folder is made absolute, so that what is stored does not depend on where it is read.
+
     Raises:
         ConfigError: if a mandatory value is missing or an interpolation leads nowhere.
     """
     try:
         content = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
-        result = OmegaConf.to_container(content, resolve=True, throw_on_missing=True)
+        result: Any = OmegaConf.to_container(content, resolve=True, throw_on_missing=True)
     except MissingMandatoryValue as error:
         raise ConfigError(f"{error.full_key} is missing; give {error.full_key}=...") from error
     except OmegaConfBaseException as error:
         raise ConfigError(str(error).splitlines()[0]) from error
-    return {**result, "choices": {group: choices[group] for group in GROUPS if group in choices}}  # type: ignore[dict-item]
+    result["output_dir"] = str(Path(str(result["output_dir"])).absolute())
+    return {**result, "choices": {group: choices[group] for group in GROUPS if group in choices}}

@@ -41,6 +41,7 @@ class Work:
         function: importable by name, called with `arguments`.
         log_file: where its standard output and error go.
         needs: keys of the work that must have ended well before.
+        alone: it has the machine to itself, and the threads of all workers; so does a training.
     """
 
     key: str
@@ -49,6 +50,7 @@ class Work:
     arguments: tuple[Any, ...]
     log_file: Path
     needs: frozenset[str] = frozenset()
+    alone: bool = False
 
 
 @dataclass
@@ -109,7 +111,7 @@ class Pool:
         try:
             while waiting or running:
                 waiting = _without_hopeless(waiting, outcomes, observer)
-                while len(running) < self.workers and (work := _next(waiting, outcomes)):
+                while len(running) < self.workers and (work := _next(waiting, running, outcomes)):
                     waiting.remove(work)
                     running.append(self._start(work))
                 wait([entry.process.sentinel for entry in running], TICK_SECONDS)
@@ -131,7 +133,8 @@ class Pool:
     def _start(self, work: Work) -> Running:
         make_folder(work.log_file.parent)
         receive, send = self._context.Pipe(duplex=False)
-        process = self._context.Process(target=_main, args=(work, self.threads, send), name=work.name)
+        threads = self.threads * self.workers if work.alone else self.threads
+        process = self._context.Process(target=_main, args=(work, threads, send), name=work.name)
         process.start()
         send.close()
         return Running(work, process, receive)
@@ -183,9 +186,11 @@ def _start_server(threads: int) -> None:
             os.environ[name] = value
 
 
-def _next(waiting: Sequence[Work], outcomes: Mapping[str, Outcome]) -> Work | None:
-    """The first work whose needs are met."""
-    return next((work for work in waiting if work.needs <= outcomes.keys()), None)
+def _next(waiting: Sequence[Work], running: Sequence[Running], outcomes: Mapping[str, Outcome]) -> Work | None:
+    """The first work whose needs are met, if nothing stands against starting it now."""
+    ready = next((work for work in waiting if work.needs <= outcomes.keys()), None)
+    crowded = ready is not None and running and (ready.alone or any(entry.work.alone for entry in running))
+    return None if crowded else ready
 
 
 def _without_hopeless(waiting: Sequence[Work], outcomes: dict[str, Outcome], observer: Observer) -> list[Work]:

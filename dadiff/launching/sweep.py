@@ -134,7 +134,15 @@ class SweepRun:
         function = BUILDERS[artefact.kind]
         log_file = self.folder / "logs" / f"{artefact.kind}-{artefact.key}.log"
         config = _with_parent(preparation.config, parent)
-        return Work(artefact.key, preparation.name, function, (config,), log_file, preparation.needs)
+        return Work(
+            artefact.key,
+            preparation.name,
+            function,
+            (config,),
+            log_file,
+            preparation.needs,
+            artefact.kind == "denoiser",
+        )
 
     def _run(self, cell: PlannedCell, parent: str | None) -> Work:
         key = cell.identity.key
