@@ -5,21 +5,22 @@ Heavy packages are imported when a run begins, so that help and configuration er
 
 from __future__ import annotations
 
-import logging
 import os
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import hydra
+from hydra import compose, initialize_config_dir
+from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
 from omegaconf import DictConfig
 
 from dadiff.config.composed import plain
 from dadiff.errors import DadiffError
 from dadiff.folders import shipped
-
-log = logging.getLogger("dadiff")
 
 
 def one_run(config: dict[str, Any]) -> None:
@@ -56,6 +57,23 @@ def reported(work: Callable[[], None]) -> None:
         raise SystemExit(1) from error
 
 
+def check_what_is_printed(arguments: list[str]) -> None:
+    """For `dadiff --cfg ...`, which Hydra answers without running anything: check the configuration first."""
+    given = get_args_parser().parse_args(arguments)
+    if given.cfg is None:
+        return
+    from dadiff.config import assemble
+
+    extra = [f"hydra.searchpath=[file://{Path(given.config_dir).absolute()}]"] if given.config_dir else []
+    try:
+        with initialize_config_dir(str(shipped("conf").absolute()), version_base="1.3"):
+            config = compose("config", [*given.overrides, *extra], return_hydra_config=True)
+    except HydraException:
+        return  # Hydra will compose it again, and say it in its own words
+    resolved = plain(config, config.hydra.runtime.choices)
+    assemble(resolved, resolved["choices"])
+
+
 def main() -> None:
     """Entry point."""
     from dadiff.launching import register
@@ -63,6 +81,7 @@ def main() -> None:
     os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # spinning threads slow each other on a busy machine
     register()
+    reported(lambda: check_what_is_printed(sys.argv[1:]))
     reported(_application)
 
 

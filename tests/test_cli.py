@@ -124,3 +124,10 @@ def test_a_bad_file_is_named(dadiff, tmp_path):
 def test_an_output_folder_that_cannot_be_written_is_named(dadiff, tmp_path):
     (tmp_path / "file").write_text("in the way")
     assert "file/below" in refused(dadiff(*TINY, "output_dir=file/below"))
+
+
+def test_a_configuration_is_checked_before_it_is_printed(dadiff):
+    assert "_target_: dadiff.systems.double_integrator" in dadiff("--cfg", "job").stdout
+    mistaken = dadiff("--cfg", "job", "evaluation.samples=2.5")
+    assert "evaluation (evaluation/default.yaml): samples is 2.5" in refused(mistaken)
+    assert not mistaken.stdout

@@ -9,6 +9,8 @@ import tempfile
 from pathlib import Path
 
 from dadiff.errors import DadiffError
+from dadiff.store import Sweeps
+from dadiff.tracking import attach
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -37,9 +39,12 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def write(options: argparse.Namespace) -> Path:
-    """Write the report of what lies in the results folder, or of what MLflow holds."""
+    """Write the report of what lies in the results folder, and add it to MLflow; or of what MLflow holds."""
     if options.tracking_uri is None:
-        return _write(options, options.output_dir)
+        index = _write(options, options.output_dir)
+        for name in options.sweep:
+            attach(Sweeps(options.output_dir).folder(name), [index, index.with_name("report.json")], "report")
+        return index
     from dadiff.tracking.download import download
 
     with tempfile.TemporaryDirectory() as folder:

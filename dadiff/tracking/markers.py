@@ -30,6 +30,11 @@ def read_marker(folder: Path, uri: str) -> Marker | None:
     return Marker(**stored) if stored else None
 
 
+def stores(folder: Path) -> list[str]:
+    """The uris of the stores that a folder was logged to."""
+    return list(_read(folder))
+
+
 def write_marker(folder: Path, uri: str, marker: Marker) -> None:
     """Set the marker of a folder for one store, leaving those for other stores alone."""
     write_json(folder / MARKER, {"stores": {**_read(folder), uri: vars(marker)}})

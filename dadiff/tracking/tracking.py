@@ -6,7 +6,7 @@ import getpass
 import logging
 import os
 import platform
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -25,7 +25,7 @@ from dadiff.tracking.content import (
     sweep_view,
     training_content,
 )
-from dadiff.tracking.markers import Marker, read_marker, write_marker
+from dadiff.tracking.markers import Marker, read_marker, stores, write_marker
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -41,6 +41,12 @@ def is_tracked(folder: Path, uri: str) -> bool:
     """Whether a folder is wholly in the store; needs no MLflow."""
     marker = read_marker(folder, uri)
     return marker is not None and marker.complete
+
+
+def attach(folder: Path, files: Sequence[Path], artifact_path: str) -> None:
+    """Add files (a report) to the MLflow runs that mirror a folder, in whichever stores they are."""
+    for uri in stores(folder):
+        Tracking(uri).attach(folder, files, artifact_path)
 
 
 @dataclass(frozen=True)
