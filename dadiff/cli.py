@@ -79,7 +79,7 @@ def main() -> None:
     from dadiff.launching import register
 
     os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # spinning threads slow each other on a busy machine
+    os.environ.setdefault("GOMP_SPINCOUNT", "20000")  # threads that spin for long slow each other on a busy machine
     register()
     reported(lambda: check_what_is_printed(sys.argv[1:]))
     reported(_application)

@@ -86,10 +86,10 @@ def _draw_panel(ax: Axes, panel: Panel) -> None:
     ax.plot(*panel.scene.target.T, "*", color="#d03a2b", ms=9, mew=0, zorder=4, label="target")
     if len(panel.scene.waypoints):
         ax.plot(*panel.scene.waypoints.T, "o", color="#3566c8", ms=5, zorder=4, label="waypoint")
-    for path in panel.paths:
+    for rank, path in enumerate(panel.paths):
         look = look_of(path.axes)
         label = path.label if path.replayed is None else ""
-        ax.plot(*path.planned.T, color=look.colour, ls=look.line, lw=1.5, label=label)
+        ax.plot(*path.planned.T, color=look.colour, ls=look.line, lw=max(3.2 - 0.7 * rank, 1.0), label=label)
         if path.replayed is not None:
             ax.plot(*path.replayed.T, color=look.colour, ls=REPLAY, lw=1.8)
     ax.set_title("\n".join(textwrap.wrap(panel.title, 30)))
@@ -103,6 +103,9 @@ def _window(ax: Axes, shared: list[Panel]) -> None:
     optimum = np.concatenate([shared[0].optimum, shared[0].scene.target])
     reach = 1.6 * max(np.ptp(optimum, axis=0).max(), 1.0)
     centre = (optimum.max(0) + optimum.min(0)) / 2
+    x, y, r = shared[0].scene.discs.T
+    rims = [np.column_stack([x + dx * r, y + dy * r]) for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1))]
+    points = np.concatenate([points, *rims])
     points = points[(np.abs(points - centre) < reach).all(axis=1)]
     middle, half = (points.max(0) + points.min(0)) / 2, 0.55 * max(np.ptp(points, axis=0).max(), 0.5)
     ax.set_xlim(middle[0] - half, middle[0] + half)
@@ -114,7 +117,7 @@ def collect(
     evidence: Evidence,
     *,
     cells: Selector,
-    case: int = 0,
+    case: int | None = None,
     robots: list[int] | None = None,
     sample_of_data: bool = False,
     apart: bool = False,
@@ -122,7 +125,7 @@ def collect(
     """Plans of one case from the same noise: the first seed, the first plan.
 
     Args:
-        case: among the stored examples.
+        case: among the stored examples; None takes the one whose optimum passes a disc most closely, or the first.
         robots: of a fleet, a row each.
         sample_of_data: a first panel with the optimum alone.
         apart: a panel a method, with the replay of its inputs, instead of one panel for all.
@@ -132,6 +135,7 @@ def collect(
     shown, drawn = varying(methods), []
     rows: list[int] | list[None] = robots or [None]
     for robot in rows if used else []:
+        case = _most_telling(used[0], robot) if case is None else case
         scene, optimum = _scene(used[0], robot, case)
         paths = [_path(method, robot, case, shown, replay=apart) for method in used]
         title = "plans" if robot is None else f"robot {used[0].finished[0].examples['robots'][robot]}"
@@ -146,6 +150,19 @@ def collect(
     across = min(len(used), 4) if apart else 2
     notes = [f"{method_name(m.axes, shown)}: {m.outcome}" for m in methods if m.lost]
     return Paths(drawn, across, [m.finished[0].key for m in used], notes)
+
+
+def _most_telling(method: Method, robot: int | None) -> int:
+    """The stored case whose optimum comes closest to a disc; the first where there are none."""
+    stored = method.finished[0].examples["reference_states"]
+    scenes = [_scene(method, robot, case) for case in range(len(stored if robot is None else stored[robot]))]
+    return int(np.argmin([_clearance(scene.discs, optimum) for scene, optimum in scenes]))
+
+
+def _clearance(discs: np.ndarray, path: np.ndarray) -> float:
+    """The least distance of a path (T+1, 2) from the rims of discs (k, 3); inf without discs."""
+    apart = np.linalg.norm(path[:, None] - discs[:, :2], axis=-1) - discs[:, 2]
+    return float(apart.min(initial=np.inf))
 
 
 def _of(method: Method, name: str, robot: int | None, case: int) -> np.ndarray:
