@@ -88,8 +88,9 @@ def _draw_panel(ax: Axes, panel: Panel) -> None:
         ax.plot(*panel.scene.waypoints.T, "o", color="#3566c8", ms=5, zorder=4, label="waypoint")
     for rank, path in enumerate(panel.paths):
         look = look_of(path.axes)
+        width = max(3.2 - 0.7 * rank, 1.0) if len(panel.paths) > 1 else 1.5
         label = path.label if path.replayed is None else ""
-        ax.plot(*path.planned.T, color=look.colour, ls=look.line, lw=max(3.2 - 0.7 * rank, 1.0), label=label)
+        ax.plot(*path.planned.T, color=look.colour, ls=look.line, lw=width, label=label)
         if path.replayed is not None:
             ax.plot(*path.replayed.T, color=look.colour, ls=REPLAY, lw=1.8)
     ax.set_title("\n".join(textwrap.wrap(panel.title, 30)))
@@ -147,7 +148,7 @@ def collect(
             ]
         else:
             drawn.append(Panel(title, scene, optimum, paths))
-    across = min(len(used), 4) if apart else 2
+    across = min(len(used), 6 if robots else 4) if apart else 2
     notes = [f"{method_name(m.axes, shown)}: {m.outcome}" for m in methods if m.lost]
     return Paths(drawn, across, [m.finished[0].key for m in used], notes)
 
