@@ -13,8 +13,9 @@ import pytest
 
 from dadiff.errors import ConfigError, DataError
 from dadiff.launching.outcome import why
-from dadiff.launching.pool import Pool, Work, cores
+from dadiff.launching.process_pool import ProcessPool, cores
 from dadiff.launching.table import Table, clock, last_line
+from dadiff.launching.work import Work
 
 
 def write(path: Path, text: str, seconds: float = 0.0) -> None:
@@ -74,7 +75,7 @@ def work(root: Path, key: str, function, *arguments, needs=()) -> Work:
 
 @pytest.fixture(scope="module")
 def pool():
-    return Pool(workers=4, preload=["torch"])
+    return ProcessPool(workers=4, preload=["torch"])
 
 
 def test_every_way_to_end_has_its_status_and_reason_and_harms_no_other(pool, tmp_path):
@@ -101,7 +102,7 @@ def test_every_way_to_end_has_its_status_and_reason_and_harms_no_other(pool, tmp
 
 def test_a_job_that_takes_too_long_is_ended(pool, tmp_path):
     works = [work(tmp_path, "sleep", fail, "sleep")]
-    outcomes = Pool(workers=1, time_limit=0.5).run(works, Silent())
+    outcomes = ProcessPool(workers=1, time_limit=0.5).run(works, Silent())
     assert outcomes["sleep"].status == "timeout"
     assert "time limit of 0.5 s" in outcomes["sleep"].reason
 
@@ -111,7 +112,7 @@ def test_work_waits_for_what_it_needs_without_holding_a_worker(tmp_path):
     works = [work(tmp_path, f"cell{i}", write, out, f"cell{i}", needs=["train"]) for i in range(3)]
     works += [work(tmp_path, "train", write, out, "train", 0.5), work(tmp_path, "free", write, out, "free")]
     observer = Silent()
-    outcomes = Pool(workers=2).run(works, observer)
+    outcomes = ProcessPool(workers=2).run(works, observer)
     assert out.read_text().split()[:2] == ["free", "train"]
     assert observer.most == 2
     assert {outcome.status for outcome in outcomes.values()} == {"finished"}
@@ -131,7 +132,7 @@ def test_what_needs_a_failure_is_given_up_with_its_reason(pool, tmp_path):
 
 
 def test_threads_are_limited_and_work_after_the_fork(tmp_path):
-    outcomes = Pool(workers=1).run([work(tmp_path, "a", multiply, tmp_path / "a")], Silent())
+    outcomes = ProcessPool(workers=1).run([work(tmp_path, "a", multiply, tmp_path / "a")], Silent())
     assert outcomes["a"].reason is None
     assert (tmp_path / "a").read_text() == "64000000 1 1"
 
@@ -153,12 +154,12 @@ def test_an_interrupt_ends_the_jobs(pool, tmp_path):
 @pytest.mark.parametrize("bad", [{"workers": 0}, {"workers": 1, "threads": -1}, {"workers": 1, "time_limit": 0.0}])
 def test_numbers_that_make_no_sense_are_refused(bad):
     with pytest.raises(ConfigError, match="must be positive"):
-        Pool(**bad)
+        ProcessPool(**bad)
 
 
 def test_workers_and_threads_do_not_exceed_the_cores():
-    assert Pool(None, threads=1).workers == cores()
-    assert Pool(None, threads=cores() + 1).workers == 1
+    assert ProcessPool(None, threads=1).workers == cores()
+    assert ProcessPool(None, threads=cores() + 1).workers == 1
 
 
 def test_reasons_tell_memory_from_other_failures():
@@ -197,7 +198,7 @@ def test_work_that_is_alone_waits_for_the_rest_and_has_every_thread(tmp_path):
     crowd = [work(tmp_path, key, threads_and_times) for key in "ab"]
     alone = replace(work(tmp_path, "c", threads_and_times), alone=True)
     after = [work(tmp_path, key, threads_and_times) for key in "de"]
-    Pool(workers=2, threads=1, preload=["torch"]).run([*crowd, alone, *after], Silent())
+    ProcessPool(workers=2, threads=1, preload=["torch"]).run([*crowd, alone, *after], Silent())
     seen = {key: (tmp_path / "logs" / f"{key}.log").read_text().split() for key in "abcde"}
     assert {key: int(words[0]) for key, words in seen.items()} == {"a": 1, "b": 1, "c": 2, "d": 1, "e": 1}
     begun, ended = ({key: float(words[k]) for key, words in seen.items()} for k in (1, 2))

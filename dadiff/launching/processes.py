@@ -2,27 +2,9 @@
 
 from __future__ import annotations
 
-import shlex
-import signal
-import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from types import FrameType
-
-from hydra.core.utils import JobReturn, JobStatus
-from hydra.plugins.launcher import Launcher
-from hydra.types import HydraContext, TaskFunction
-from omegaconf import DictConfig
-
-from dadiff.config.composed import plain
-from dadiff.errors import DadiffError
-from dadiff.launching.composing import Composer
-from dadiff.launching.outcome import Outcome
-from dadiff.launching.plan import describe, make_plan
-from dadiff.launching.pool import Pool, Running, Work
-from dadiff.launching.sweep import SweepRun, summary
-from dadiff.launching.table import Table
-from dadiff.store import DONE
+from dadiff.launching.launcher import SweepLauncher
+from dadiff.launching.process_pool import ProcessPool
+from dadiff.launching.sweep import SweepRun
 
 PRELOAD = (
     "dadiff.cli",
@@ -34,100 +16,13 @@ PRELOAD = (
 )
 
 
-class ProcessesLauncher(Launcher):
+class ProcessesLauncher(SweepLauncher):
     """One process per job; `conf/hydra/launcher/processes.yaml` explains the parameters."""
 
     def __init__(self, workers: int | None, threads: int, time_limit: float | None, sweep: str | None) -> None:
-        self.workers, self.threads, self.time_limit, self.sweep = workers, threads, time_limit, sweep
+        super().__init__(sweep)
+        self.workers, self.threads, self.time_limit = workers, threads, time_limit
 
-    def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
-        """Called by Hydra's sweeper, which composes every cell with the same context before it launches."""
-        self.config = config
-        self.composer = hydra_context.config_loader = Composer(hydra_context.config_loader)  # type: ignore[assignment]
-
-    def launch(self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int) -> Sequence[JobReturn]:
-        """Run the cells. Leaves with exit code 1 if any failed, 130 if interrupted."""
-        try:
-            code = self._launch(job_overrides)
-        except DadiffError as error:
-            sys.stderr.write(f"dadiff: {error}\n")
-            code = 1
-        if code:
-            raise SystemExit(code)
-        return [JobReturn(overrides=list(cell), status=JobStatus.COMPLETED) for cell in job_overrides]
-
-    def _launch(self, job_overrides: Sequence[Sequence[str]]) -> int:
-        composed = [self.composer.load_sweep_config(self.config, list(cell)) for cell in job_overrides]
-        plan = make_plan([plain(config, config.hydra.runtime.choices) for config in composed])
-        if plan.cells[0].config.get("dry_run"):
-            sys.stdout.write(describe(plan) + "\n")
-            return 0
-        name = self.sweep or self.config.hydra.runtime.choices.get("sweeps")
-        run = SweepRun.of(plan, name, "dadiff " + shlex.join(sys.argv[1:]), definition(self.config))
-        return 0 if run.is_over() and _say_over(run) else self._run(run)
-
-    def _run(self, run: SweepRun) -> int:
-        """Run what is to be run; returns the exit code."""
-        skipped = len(run.plan.cells) - len(run.plan.waiting)
-        pool = Pool(self.workers, self.threads, self.time_limit, PRELOAD) if run.plan.waiting else None
-        parent = run.open()
-        works = run.works(parent)
-        watch = Watch(run, Table(sys.stderr, len(works), skipped))
-        interrupted = False
-        if skipped:
-            sys.stderr.write(f"{skipped} of {len(run.plan.cells)} cells are done already: skipped\n")
-        try:
-            if pool is not None:
-                with _terminated_as_interrupt():
-                    pool.run(works, watch)
-        except KeyboardInterrupt:
-            interrupted = True
-        watch.table.close()
-        sweep = run.close(parent, watch.outcomes, interrupted=interrupted)
-        sys.stderr.write(f"{summary(sweep, skipped, run.folder)}\n{run.tracking.how_to_look(run.name)}\n")
-        return 130 if interrupted else int(any(cell.status not in DONE for cell in sweep.cells))
-
-
-class Watch:
-    """Follows a sweep's work: draws it, records failures at once, and keeps how each piece ended."""
-
-    def __init__(self, run: SweepRun, table: Table) -> None:
-        self.table, self.outcomes = table, dict[str, Outcome]()
-        self._run, self._cells = run, {cell.identity.key: cell for cell in run.plan.cells}
-
-    def ended(self, work: Work, outcome: Outcome) -> None:
-        """Work ended."""
-        self.outcomes[work.key] = outcome
-        self.table.ended(work, outcome)
-        if work.key in self._cells:
-            self._run.ended(self._cells[work.key], outcome)
-
-    def tick(self, running: Sequence[Running]) -> None:
-        """Time has passed."""
-        self.table.tick(running)
-
-
-def definition(config: DictConfig) -> dict[str, str]:
-    """What the sweep ranges over and fixes: its file's parameters, and the command's on top."""
-    given = (str(override).partition("=") for override in config.hydra.overrides.task)
-    params = {str(name): str(value) for name, value in (config.hydra.sweeper.get("params") or {}).items()}
-    return params | {name.lstrip("+~"): value for name, _, value in given}
-
-
-def _say_over(run: SweepRun) -> bool:
-    sys.stderr.write(f"{run.name}: all {len(run.plan.cells)} cells are done already (force=true runs them again)\n")
-    return True
-
-
-@contextmanager
-def _terminated_as_interrupt() -> Iterator[None]:
-    """Treat SIGTERM, which batch systems send, as Ctrl-C."""
-
-    def interrupt(number: int, frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, interrupt)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
+    def pool(self, run: SweepRun) -> ProcessPool:
+        """Its server starts at once, while the sweep is opened."""
+        return ProcessPool(self.workers, self.threads, self.time_limit, PRELOAD)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 PLUGINS = ("hydra_plugins.", "hydra._internal.core_plugins.", "dadiff.launching.")
 
@@ -18,6 +19,35 @@ class ProcessesSchema:
     sweep: str | None = None
 
 
+@dataclass
+class SlurmSchema:
+    """The typed schema under `conf/hydra/launcher/slurm.yaml`."""
+
+    _target_: str = "dadiff.launching.slurm.SlurmLauncher"
+    cluster: str = "slurm"
+    workers: int = 16
+    threads: int = 1
+    time_limit: float = 14400.0
+    memory: float | None = None
+    gpus: int | None = None
+    partition: str | None = None
+    account: str | None = None
+    options: dict[str, Any] = field(default_factory=dict)
+    sweep: str | None = None
+
+
+@dataclass
+class RaySchema:
+    """The typed schema under `conf/hydra/launcher/ray.yaml`."""
+
+    _target_: str = "dadiff.launching.ray.RayLauncher"
+    address: str | None = None
+    workers: int | None = None
+    threads: int = 1
+    time_limit: float | None = None
+    sweep: str | None = None
+
+
 def register() -> None:
     """Register launchers and their schemas.
 
@@ -26,12 +56,21 @@ def register() -> None:
     """
     from hydra.core.config_store import ConfigStore
     from hydra.core.plugins import Plugins
+    from hydra.plugins.plugin import Plugin
 
     from dadiff.launching.processes import ProcessesLauncher
+    from dadiff.launching.ray import RayLauncher
+    from dadiff.launching.slurm import SlurmLauncher
 
     Plugins.is_in_toplevel_plugins_module = staticmethod(_is_plugin)  # type: ignore[assignment]
-    Plugins.instance().register(ProcessesLauncher)
-    ConfigStore.instance().store(group="hydra/launcher", name="processes_schema", node=ProcessesSchema)
+    launchers: dict[str, tuple[type[Plugin], type]] = {
+        "processes": (ProcessesLauncher, ProcessesSchema),
+        "slurm": (SlurmLauncher, SlurmSchema),
+        "ray": (RayLauncher, RaySchema),
+    }
+    for name, (launcher, schema) in launchers.items():
+        Plugins.instance().register(launcher)
+        ConfigStore.instance().store(group="hydra/launcher", name=f"{name}_schema", node=schema)
 
 
 def _is_plugin(name: str) -> bool:

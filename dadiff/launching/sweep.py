@@ -15,7 +15,7 @@ from dadiff.identity import digest
 from dadiff.launching import jobs
 from dadiff.launching.outcome import Outcome
 from dadiff.launching.plan import Plan, PlannedCell, Preparation
-from dadiff.launching.pool import Work
+from dadiff.launching.work import Work
 from dadiff.store import DONE, Cache, Cell, Results, Sweep, Sweeps
 from dadiff.tracking import Tracking, is_tracked
 

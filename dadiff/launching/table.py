@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TextIO
 
 from dadiff.launching.outcome import Outcome
-from dadiff.launching.pool import Running, Work
+from dadiff.launching.work import Running, Work
 from dadiff.store import DONE
 
 REDRAW_SECONDS = 0.5

@@ -51,7 +51,7 @@ PLACES = {
     "MLflow: everything logged, run open": "mlflow:MlflowClient.set_terminated:before",
     "MLflow: run closed, not marked": "mlflow:MlflowClient.set_terminated:after",
     "launcher: after its start": "dadiff.launching.sweep:SweepRun.open:after",
-    "launcher: as a job ends": "dadiff.launching.processes:Watch.ended:before",
+    "launcher: as a job ends": "dadiff.launching.launcher:Watch.ended:before",
     "launcher: before its end": "dadiff.launching.sweep:SweepRun.close:before",
     "launcher: in MLflow's table": "dadiff.tracking.tracking:Tracking.close_sweep:before",
 }

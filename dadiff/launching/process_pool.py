@@ -1,0 +1,130 @@
+"""Runs work in processes of its own, so that no job can take another with it.
+
+Processes are forked from a server that has imported what takes seconds, so that each starts at once. A job that
+raises, is killed, or exceeds its time ends with an `Outcome` that says why.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from multiprocessing.connection import Connection, wait
+from multiprocessing.context import ForkServerProcess
+
+from dadiff.launching.outcome import Outcome
+from dadiff.launching.pool import GRACE_SECONDS, TICK_SECONDS, Pool, check_positive
+from dadiff.launching.work import Observer, Running, Work, environment, perform, thread_limits
+
+QUIET = {"PYTHONWARNINGS": "ignore:resource_tracker"}  # which warns of the locks of every job that was ended
+
+
+@dataclass
+class Process(Running):
+    """A process at work."""
+
+    process: ForkServerProcess
+    answer: Connection
+
+
+class ProcessPool(Pool[Process]):
+    """`workers` processes at a time with `threads` threads each.
+
+    Args:
+        workers: None for as many as the cores allow.
+        time_limit: seconds that a job may take; None for no limit.
+        preload: modules that the server imports before it forks.
+
+    Raises:
+        ConfigError: if a number is not positive.
+    """
+
+    def __init__(
+        self, workers: int | None, threads: int = 1, time_limit: float | None = None, preload: Sequence[str] = ()
+    ) -> None:
+        check_positive(threads=threads)
+        super().__init__(max(1, cores() // threads) if workers is None else workers, threads, time_limit)
+        self._context = multiprocessing.get_context("forkserver")
+        self._context.set_forkserver_preload(list(preload))
+        _start_server(threads)
+
+    def run(self, works: Sequence[Work], observer: Observer) -> dict[str, Outcome]:
+        """Run everything once the server has imported everything, so that no job's time limit counts that."""
+        probe = self._context.Process(target=int)
+        probe.start()
+        probe.join()
+        return super().run(works, observer)
+
+    def _has_room(self, work: Work, running: Sequence[Process]) -> bool:
+        crowded = running and (work.alone or any(entry.work.alone for entry in running))
+        return super()._has_room(work, running) and not crowded
+
+    def _start(self, work: Work) -> Process:
+        receive, send = self._context.Pipe(duplex=False)
+        threads = self.threads * self.workers if work.alone else self.threads
+        process = self._context.Process(target=_main, args=(work, threads, send), name=work.name)
+        process.start()
+        send.close()
+        return Process(work, process, receive)
+
+    def _pause(self, running: Sequence[Process]) -> None:
+        wait([entry.process.sentinel for entry in running], TICK_SECONDS)
+
+    def _end(self, entry: Process) -> tuple[str, str | None] | None:
+        return None if entry.process.exitcode is None else _answer(entry)
+
+    def _stop(self, running: Sequence[Process]) -> None:
+        for entry in running:
+            entry.process.terminate()
+        deadline = time.monotonic() + GRACE_SECONDS
+        for entry in running:
+            entry.process.join(max(0.0, deadline - time.monotonic()))
+            if entry.process.exitcode is None:
+                entry.process.kill()
+                entry.process.join()
+
+
+def cores() -> int:
+    """The cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _start_server(threads: int) -> None:
+    """Start the server that jobs are forked from; it inherits the limits on threads of its environment."""
+    from multiprocessing import forkserver
+
+    with environment({**thread_limits(threads), **QUIET}):
+        forkserver.ensure_running()
+
+
+def _answer(entry: Process) -> tuple[str, str | None]:
+    """What the job said of its end, or what its exit code says in its place."""
+    if entry.answer.poll():
+        try:
+            return entry.answer.recv()
+        except EOFError:
+            pass  # it ended without a word
+    code = entry.process.exitcode or 0
+    if code >= 0:
+        return "failed", f"its process exited with code {code}"
+    name = signal.Signals(-code).name
+    memory = ", perhaps because memory ran out: take fewer hydra.launcher.workers" if name == "SIGKILL" else ""
+    return "killed", f"killed by {name}{memory}"
+
+
+def _main(work: Work, threads: int, answer: Connection) -> None:
+    """The life of a job's process."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the launcher's to handle
+    threading.Thread(target=_die_with_launcher, daemon=True).start()
+    answer.send(perform(work, threads))
+
+
+def _die_with_launcher() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os.kill(os.getpid(), signal.SIGKILL)
