@@ -62,6 +62,7 @@ class Experiment:
     @cached_property
     def demonstrations(self) -> Demonstrations:
         """What is learned from: from the cache, or made now."""
+        _ = self.target  # which refuses a system that the task cannot plan for
         draw = self.parts["dataset"].train
         build = partial(save_data, draw=lambda: draw(self.parts["task"], self.parts["system"]))
         return Demonstrations(**load_data(self._cached(self.identity.demonstrations, build)))
