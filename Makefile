@@ -21,6 +21,10 @@ install: .venv/installed
 	$(RUN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[test,lint,ipopt]'
 	@touch $@
 
+.venv/servers: .venv/installed
+	$(RUN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[slurm,ray,postgresql]'
+	@touch $@
+
 report: install
 	$(RUN)/dadiff +sweeps=lqr_quick output_dir=$(OUTPUTS)
 	$(RUN)/dadiff-report lqr_quick --output-dir $(OUTPUTS)
@@ -33,7 +37,7 @@ report: install
 test: install
 	OMP_NUM_THREADS=1 $(RUN)/pytest
 
-slow: install
+slow: .venv/servers
 	OMP_NUM_THREADS=1 $(RUN)/pytest -m slow
 
 lint: install

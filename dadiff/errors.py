@@ -37,5 +37,9 @@ class StoreError(DadiffError):
     """Results cannot be written to or read from where they should lie."""
 
 
+class LockedError(StoreError):
+    """Another process is working on the same thing."""
+
+
 class MissingExtraError(DadiffError):
     """An optional package is not installed."""

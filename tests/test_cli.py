@@ -13,6 +13,7 @@ import pytest
 from laws import presets
 
 from dadiff.config import GROUPS
+from dadiff.store import Sweeps
 
 ROOT = Path(__file__).parent.parent
 HEAVY = ("torch", "mlflow", "control", "cvxpy", "casadi", "matplotlib", "pandas")
@@ -112,6 +113,17 @@ def test_refusals_of_a_run_are_one_line_too(dadiff, tmp_path):
 
 
 @pytest.mark.slow
+def test_a_fleet_needs_a_family_of_robots(dadiff):
+    error = refused(dadiff("task=fleet", "system=double_integrator"))
+    assert "double_integrator" in error
+
+
+def test_a_sweep_that_another_process_runs_is_refused(dadiff, tmp_path):
+    with Sweeps(tmp_path / "outputs").running("twin"):
+        error = refused(dadiff("-m", "projector=none,known", "hydra.launcher.sweep=twin", *TINY))
+    assert f"sweep twin is being run by process {os.getpid()}" in error
+
+
 def test_a_bad_file_is_named(dadiff, tmp_path):
     for part in ("train", "test"):
         (tmp_path / "mine" / part).mkdir(parents=True)

@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 import time
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -17,6 +18,8 @@ from dadiff.launching.pool import Pool
 from dadiff.launching.ray import RayPool
 from dadiff.launching.slurm import SlurmPool
 from dadiff.launching.work import Work
+from dadiff.store import Cache
+from dadiff.tracking.client import open_client
 
 ROOT = Path(__file__).parent.parent
 SWEEP = [
@@ -139,3 +142,41 @@ def test_a_sweep_runs_skips_and_shares_its_results_with_other_launchers(launcher
     assert "2 of 3 cells are done already: skipped" in again.stderr
     assert "[1/1]" in again.stderr
     assert "3 cells, 2 done, 1 to run" in dadiff("dry_run=true").stdout
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("launcher", EACH)
+def test_jobs_end_with_a_launcher_that_is_killed_and_the_next_start_does_the_work(launcher, tmp_path):
+    outputs = tmp_path / "outputs"
+    long = [
+        "-m", "projector=none,known", "denoiser=mlp", "denoiser.width=16", "denoiser.blocks=1", "sampler=ddim",
+        "sampler.num_steps=4", "training.steps=30000", "training.checkpoint_every=50", "training.batch_size=8",
+        "dataset.train_size=60", "dataset.test_size=2", "evaluation.samples=1", "hydra.launcher.sweep=long",
+    ]  # fmt: skip
+    command = [sys.executable, "-m", "dadiff.cli", *long, *LAUNCHERS[launcher], f"output_dir={outputs}"]
+    with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.DEVNULL) as launching:
+        try:
+            checkpoints = waited_for(lambda: list(outputs.glob("cache/denoiser/*.partial/checkpoint.safetensors")))
+        finally:
+            launching.kill()
+    (key,) = (path.parent.name.split(".")[0] for path in checkpoints)
+    waited_for(lambda: not Cache(outputs).is_building("denoiser", key))
+    assert not Cache(outputs).contains("denoiser", key)
+    again = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert again.returncode == 0, again.stderr
+    assert "2 cells: 2 finished" in again.stderr
+    client = open_client(f"sqlite:///{outputs}/mlflow.db")
+    (experiment,) = (e for e in client.search_experiments() if e.name == "dadiff")
+    ended = Counter((run.data.tags["kind"], run.info.status) for run in client.search_runs([experiment.experiment_id]))
+    assert ended == {
+        ("run", "FINISHED"): 2, ("training", "FINISHED"): 1, ("training", "KILLED"): 1, ("sweep", "FINISHED"): 1
+    }  # fmt: skip
+
+
+def waited_for(condition, seconds: float = 300.0):
+    """What the condition gives as soon as that is true."""
+    deadline = time.monotonic() + seconds
+    while not (value := condition()):
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+    return value

@@ -7,6 +7,7 @@ import logging
 import math
 import multiprocessing
 import os
+import platform
 import signal
 import time
 from functools import partial
@@ -16,8 +17,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from dadiff.errors import DadiffError, DataError, StoreError
-from dadiff.store import Cache, Cell, Results, Sweep, Sweeps
+from dadiff.errors import DadiffError, DataError, LockedError, StoreError
+from dadiff.store import Cache, Cell, Results, Sweep, Sweeps, store_id
 from dadiff.store.cli import main as dadiff_cache
 
 KEY = "0123456789abcdef"
@@ -181,6 +182,47 @@ def test_sweeps_come_back(tmp_path):
     assert Sweeps(tmp_path).names() == ["quick"]
     with pytest.raises(DadiffError, match="cannot be read"):
         Sweeps(tmp_path).read("other")
+
+
+def test_one_process_at_a_time_runs_a_sweep(tmp_path):
+    sweeps = Sweeps(tmp_path)
+    assert not sweeps.is_running("quick")
+    with sweeps.running("quick") as lease:
+        assert sweeps.is_running("quick")
+        assert lease.is_held()
+        assert run_process(exit_with_the_refusal, tmp_path) == 1
+        assert "cells" not in Sweeps(tmp_path).names()
+    assert not lease.is_held()
+    assert run_process(exit_with_the_refusal, tmp_path) == 0
+    with sweeps.running("quick") as next_lease:
+        assert next_lease.is_held()
+        assert not lease.is_held()  # another launcher has taken over
+
+
+def exit_with_the_refusal(root: Path) -> None:
+    try:
+        with Sweeps(root).running("quick"):
+            raise SystemExit(0)
+    except LockedError as error:
+        named = f"process {os.getppid()} on {platform.node()}" in str(error) and "hydra.launcher.sweep" in str(error)
+        raise SystemExit(1 if named else 2) from error
+
+
+def test_a_sweep_is_free_again_when_its_launcher_is_killed(tmp_path):
+    assert run_process(run_sweep_and_die, tmp_path) == -signal.SIGKILL
+    assert not Sweeps(tmp_path).is_running("quick")
+
+
+def run_sweep_and_die(root: Path) -> None:
+    with Sweeps(root).running("quick"):
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_the_id_of_an_output_folder_goes_with_it(tmp_path):
+    name = store_id(tmp_path / "outputs")
+    assert store_id(tmp_path / "others") != name
+    (tmp_path / "outputs").rename(tmp_path / "moved")
+    assert store_id(tmp_path / "moved") == name
 
 
 def test_an_unwritable_folder_is_one_clear_line(tmp_path):

@@ -126,6 +126,21 @@ def test_runs_of_dead_processes_are_closed_and_living_ones_are_not(tracking, tmp
     assert "its process is gone" in dead.data.tags["mlflow.note.content"]
 
 
+def test_runs_of_other_hosts_are_dead_when_nobody_holds_the_lock_of_their_work(tracking, tmp_path, monkeypatch):
+    tracking.prepare()
+    other = "f" * 16
+    with monkeypatch.context() as there:
+        there.setattr("platform.node", lambda: "elsewhere")
+        living, _dead = tracking.start(KEY, "living", tmp_path), tracking.start(other, "dead", tmp_path)
+        tracking.start(other, "training/dead", tmp_path, "training")
+        sweep = tracking.start("quick", "quick", tmp_path, "sweep")
+    with Results(tmp_path).working(KEY), Sweeps(tmp_path).running("quick"):
+        assert tracking.close_dead(tmp_path) == 2
+    assert {run.info.run_id for run in runs(tracking, "attributes.status = 'RUNNING'")} == {living, sweep}
+    assert tracking.close_dead(tmp_path) == 2
+    assert len(runs(tracking, "attributes.status = 'KILLED'")) == 4
+
+
 def test_a_sweep_is_one_parent_however_often_it_is_run(tracking, tmp_path):
     run = store(tmp_path)
     cells = [Cell(run.key, run.name, run.axes, "finished"), Cell("f" * 16, "other", {}, "failed", "why")]

@@ -25,7 +25,7 @@ from dadiff.launching.pool import Pool
 from dadiff.launching.sweep import SweepRun, summary
 from dadiff.launching.table import Table
 from dadiff.launching.work import Running, Work
-from dadiff.store import DONE
+from dadiff.store import DONE, Lease, Sweeps
 
 
 class SweepLauncher(Launcher):
@@ -39,8 +39,8 @@ class SweepLauncher(Launcher):
         self.sweep = sweep
 
     @abstractmethod
-    def pool(self, run: SweepRun) -> Pool[Any]:
-        """What runs the jobs of this start of a sweep."""
+    def pool(self, run: SweepRun, lease: Lease) -> Pool[Any]:
+        """What runs the jobs of this start of a sweep, as long as the lease is held."""
 
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
         """Called by Hydra's sweeper, which composes every cell with the same context before it launches."""
@@ -52,7 +52,7 @@ class SweepLauncher(Launcher):
         try:
             code = self._launch(job_overrides)
         except DadiffError as error:
-            sys.stderr.write(f"dadiff: {error}\n")
+            sys.stderr.write(f"dadiff: error: {error}\n")
             code = 1
         if code:
             raise SystemExit(code)
@@ -66,12 +66,15 @@ class SweepLauncher(Launcher):
             return 0
         name = self.sweep or self.config.hydra.runtime.choices.get("sweeps")
         run = SweepRun.of(plan, name, "dadiff " + shlex.join(sys.argv[1:]), definition(self.config))
-        return 0 if run.is_over() and _say_over(run) else self._run(run)
+        if run.is_over():
+            return _say_over(run)
+        with Sweeps(run.output_dir).running(run.name) as lease:
+            return self._run(run, lease)
 
-    def _run(self, run: SweepRun) -> int:
+    def _run(self, run: SweepRun, lease: Lease) -> int:
         """Run what is to be run; returns the exit code."""
         skipped = len(run.plan.cells) - len(run.plan.waiting)
-        pool = self.pool(run) if run.plan.waiting else None
+        pool = self.pool(run, lease) if run.plan.waiting else None
         parent = run.open()
         works = run.works(parent)
         watch = Watch(run, Table(sys.stderr, len(works), skipped))
@@ -116,9 +119,9 @@ def definition(config: DictConfig) -> dict[str, str]:
     return params | {name.lstrip("+~"): value for name, _, value in given}
 
 
-def _say_over(run: SweepRun) -> bool:
+def _say_over(run: SweepRun) -> int:
     sys.stderr.write(f"{run.name}: all {len(run.plan.cells)} cells are done already (force=true runs them again)\n")
-    return True
+    return 0
 
 
 @contextmanager

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dadiff.launching.launcher import SweepLauncher
 from dadiff.launching.process_pool import ProcessPool
 from dadiff.launching.sweep import SweepRun
+from dadiff.store import Lease
 
 PRELOAD = (
     "dadiff.cli",
@@ -23,6 +24,6 @@ class ProcessesLauncher(SweepLauncher):
         super().__init__(sweep)
         self.workers, self.threads, self.time_limit = workers, threads, time_limit
 
-    def pool(self, run: SweepRun) -> ProcessPool:
+    def pool(self, run: SweepRun, lease: Lease) -> ProcessPool:
         """Its server starts at once, while the sweep is opened."""
         return ProcessPool(self.workers, self.threads, self.time_limit, PRELOAD)

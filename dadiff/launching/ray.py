@@ -13,6 +13,7 @@ from dadiff.launching.outcome import Outcome
 from dadiff.launching.pool import GRACE_SECONDS, TICK_SECONDS, Pool, check_positive
 from dadiff.launching.sweep import SweepRun
 from dadiff.launching.work import Observer, Queued, Work, environment, perform, thread_limits
+from dadiff.store import Lease
 
 
 @dataclass
@@ -33,13 +34,21 @@ class RayPool(Pool[RayTask]):
         address: of a cluster; None starts one on this machine.
         workers: None for as many as the cluster's cores allow.
         time_limit: seconds that a job may take; None for no limit.
+        lease: of the launcher; jobs end themselves without it.
 
     Raises:
         ConfigError: if a number is not positive, or no cluster answers at the address.
         MissingExtraError: if Ray is not installed.
     """
 
-    def __init__(self, address: str | None, workers: int | None, threads: int, time_limit: float | None) -> None:
+    def __init__(
+        self,
+        address: str | None,
+        workers: int | None,
+        threads: int,
+        time_limit: float | None,
+        lease: Lease | None = None,
+    ) -> None:
         check_positive(workers=workers, threads=threads, time_limit=time_limit)
         try:
             import ray
@@ -55,7 +64,7 @@ class RayPool(Pool[RayTask]):
             raise ConfigError(f"hydra.launcher: no Ray cluster answers at address {address}") from error
         cores = int(ray.cluster_resources().get("CPU", 1))
         super().__init__(workers or max(1, cores // threads), threads, time_limit)
-        self._ray = ray
+        self._ray, self._lease = ray, lease
         self._perform = ray.remote(num_cpus=threads, max_retries=0, max_calls=1)(perform)
 
     def run(self, works: Sequence[Work], observer: Observer) -> dict[str, Outcome]:
@@ -67,7 +76,7 @@ class RayPool(Pool[RayTask]):
 
     def _start(self, work: Work) -> RayTask:
         work.log_file.unlink(missing_ok=True)
-        return RayTask(work, self._perform.remote(work, self.threads))
+        return RayTask(work, self._perform.remote(work, self.threads, self._lease))
 
     def _pause(self, running: Sequence[RayTask]) -> None:
         self._ray.wait([entry.ref for entry in running], timeout=TICK_SECONDS)
@@ -103,6 +112,6 @@ class RayLauncher(SweepLauncher):
         super().__init__(sweep)
         self.address, self.workers, self.threads, self.time_limit = address, workers, threads, time_limit
 
-    def pool(self, run: SweepRun) -> RayPool:
+    def pool(self, run: SweepRun, lease: Lease) -> RayPool:
         """On the cluster at the address, or a new one."""
-        return RayPool(self.address, self.workers, self.threads, self.time_limit)
+        return RayPool(self.address, self.workers, self.threads, self.time_limit, lease)

@@ -15,8 +15,10 @@ from dadiff.launching.launcher import SweepLauncher
 from dadiff.launching.pool import GRACE_SECONDS, Pool
 from dadiff.launching.sweep import SweepRun
 from dadiff.launching.work import Queued, Work, environment, perform, thread_limits
+from dadiff.store import Lease
 
 POLL_SECONDS = 1.0  # of files on a shared folder
+ASK_SECONDS = 60.0  # between two questions to Slurm, which alone knows of a job that died without a word
 MARGIN_MINUTES = 2  # asked for beyond the time limit, which the launcher watches; Slurm's own is the net below
 DEATHS = {"FAILED": "failed", "TIMEOUT": "timeout", "OUT_OF_MEMORY": "out_of_memory"}
 
@@ -36,6 +38,7 @@ class SlurmPool(Pool[SlurmJob]):
         folder: where submitit keeps its files; all nodes see it.
         cluster: "slurm" or "local".
         asked: what else a job asks for, in submitit's words; None asks for nothing.
+        lease: of the launcher; jobs end themselves without it.
 
     Raises:
         ConfigError: if a number is not positive, or there is no such cluster.
@@ -43,9 +46,17 @@ class SlurmPool(Pool[SlurmJob]):
     """
 
     def __init__(
-        self, folder: Path, cluster: str, workers: int, threads: int, time_limit: float, asked: Mapping[str, Any]
+        self,
+        folder: Path,
+        cluster: str,
+        workers: int,
+        threads: int,
+        time_limit: float,
+        asked: Mapping[str, Any],
+        lease: Lease | None = None,
     ) -> None:
         super().__init__(workers, threads, time_limit)
+        self._lease, self._asked = lease, time.monotonic()
         if cluster not in ("slurm", "local"):
             raise ConfigError(f"hydra.launcher: cluster is {cluster}; it must be slurm or local")
         if cluster == "slurm" and shutil.which("srun") is None:
@@ -67,12 +78,16 @@ class SlurmPool(Pool[SlurmJob]):
         work.log_file.unlink(missing_ok=True)
         try:
             with environment(thread_limits(self.threads)):
-                return SlurmJob(work, self._executor.submit(perform, work, self.threads))
+                return SlurmJob(work, self._executor.submit(perform, work, self.threads, self._lease))
         except (FailedJobError, FailedSubmissionError) as error:
             return SlurmJob(work, None, refusal=f"Slurm did not take the job: {' '.join(str(error).split())}")
 
     def _pause(self, running: Sequence[SlurmJob]) -> None:
         time.sleep(POLL_SECONDS)
+        if time.monotonic() - self._asked > ASK_SECONDS:
+            self._asked = time.monotonic()
+            for entry in [entry for entry in running if entry.refusal is None][:1]:
+                entry.job.done(force_check=True)  # one question brings the states of all jobs
 
     def _end(self, entry: SlurmJob) -> tuple[str, str | None] | None:
         from submitit.core.utils import UncompletedJobError
@@ -124,7 +139,7 @@ class SlurmLauncher(SweepLauncher):
             "slurm_additional_parameters": dict(options),
         }
 
-    def pool(self, run: SweepRun) -> SlurmPool:
+    def pool(self, run: SweepRun, lease: Lease) -> SlurmPool:
         """With submitit's files beside the sweep's logs."""
         folder = run.folder / "submitit"
-        return SlurmPool(folder, self.cluster, self.workers, self.threads, self.time_limit, self.asked)
+        return SlurmPool(folder, self.cluster, self.workers, self.threads, self.time_limit, self.asked, lease)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import logging
 import os
+import signal
 import sys
+import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -14,7 +16,9 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from dadiff.launching.outcome import Outcome, why
+from dadiff.store import Lease
 
+LEASE_SECONDS = 5.0  # between two looks at the launcher's lease
 THREAD_LIMITS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 
 
@@ -77,9 +81,15 @@ class Observer(Protocol):
         ...
 
 
-def perform(work: Work, threads: int) -> tuple[str, str | None]:
-    """Do the work, in a process of its own. Returns its status, and the reason if it failed."""
+def perform(work: Work, threads: int, lease: Lease | None = None) -> tuple[str, str | None]:
+    """Do the work, in a process of its own. Returns its status, and the reason if it failed.
+
+    Args:
+        lease: of the launcher, without which the process ends itself; None if it ends with its launcher anyway.
+    """
     _redirect(work.log_file)
+    if lease is not None:
+        threading.Thread(target=_die_without, args=(lease,), daemon=True).start()
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s", force=True)
     if "torch" in sys.modules:
         sys.modules["torch"].set_num_threads(threads)
@@ -89,6 +99,15 @@ def perform(work: Work, threads: int) -> tuple[str, str | None]:
         traceback.print_exc()
         return why(error)
     return "finished", None
+
+
+def _die_without(lease: Lease) -> None:
+    """A launcher that is killed cannot end its jobs on other machines, and its next start would do their work again."""
+    looks_in_vain = 0
+    while looks_in_vain < 2:
+        time.sleep(LEASE_SECONDS)
+        looks_in_vain = 0 if lease.is_held() else looks_in_vain + 1
+    os.kill(os.getpid(), signal.SIGKILL)
 
 
 def thread_limits(threads: int) -> dict[str, str]:

@@ -4,7 +4,8 @@ Everything is written under a temporary name and renamed, so that a reader finds
 """
 
 from dadiff.store.cache import Cache, Entry
+from dadiff.store.folder import store_id
 from dadiff.store.results import DONE, Results, StoredRun
-from dadiff.store.sweeps import Cell, Sweep, Sweeps
+from dadiff.store.sweeps import Cell, Lease, Sweep, Sweeps
 
-__all__ = ["DONE", "Cache", "Cell", "Entry", "Results", "StoredRun", "Sweep", "Sweeps"]
+__all__ = ["DONE", "Cache", "Cell", "Entry", "Lease", "Results", "StoredRun", "Sweep", "Sweeps", "store_id"]

@@ -14,7 +14,7 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
-from dadiff.errors import DataError, StoreError
+from dadiff.errors import DataError, LockedError, StoreError
 
 FORMAT = 1
 """Version of everything that `dadiff.store` writes; readers refuse newer ones."""
@@ -104,12 +104,21 @@ def sync_folder(folder: Path) -> None:
 
 
 @contextmanager
-def locked(path: Path, what: str) -> Iterator[None]:
-    """Hold a lock that is freed when its process ends, however it ends. Says so when it has to wait."""
+def locked(path: Path, what: str, patience: float | None = None) -> Iterator[None]:
+    """Hold a lock that is freed when its process ends, however it ends. Says so when it has to wait.
+
+    Args:
+        patience: seconds to wait for it; None for as long as it takes.
+
+    Raises:
+        LockedError: if another process holds it for longer.
+    """
     lock = _lock(path)
     try:
-        lock.acquire(timeout=0)
+        lock.acquire(timeout=patience or 0)
     except Timeout:
+        if patience is not None:
+            raise LockedError(f"{what}: another process is working on it; wait until it ends") from None
         log.info("waiting for %s, which another process is working on", what)
         lock.acquire()
     try:

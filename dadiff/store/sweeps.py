@@ -1,13 +1,24 @@
-"""Sweeps on disk: `sweeps/<name>/sweep.json` says which cells a sweep has, and how each ended."""
+"""Sweeps on disk: `sweeps/<name>/sweep.json` says which cells a sweep has, and how each ended.
+
+One process at a time runs a sweep: it holds the lock beside the record, and `launcher.json` says who it is.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+import platform
+import uuid
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from dadiff.store.files import make_folder, read_json, write_json
+from dadiff.errors import DataError, LockedError
+from dadiff.store.files import is_locked, locked, make_folder, read_json, write_json
+
+PATIENCE_SECONDS = 2.0  # for a lock that is only being looked at
+HOLDER = "launcher.json"
 
 
 @dataclass(frozen=True)
@@ -41,6 +52,26 @@ class Sweep:
     cells: Sequence[Cell]
 
 
+@dataclass(frozen=True)
+class Lease:
+    """The right to run a sweep, as its launcher has it until its process ends. Jobs on any machine can look at it.
+
+    Args:
+        folder: of the sweep.
+        token: of this launcher.
+    """
+
+    folder: Path
+    token: str
+
+    def is_held(self) -> bool:
+        """Whether the launcher that took it still runs."""
+        try:
+            return _is_run(self.folder) and read_json(self.folder / HOLDER)["token"] == self.token
+        except DataError:
+            return True
+
+
 class Sweeps:
     """The sweeps below an output folder."""
 
@@ -54,6 +85,32 @@ class Sweeps:
     def names(self) -> list[str]:
         """The names of all stored sweeps."""
         return sorted(path.parent.name for path in self.root.glob("*/sweep.json"))
+
+    @contextmanager
+    def running(self, name: str) -> Iterator[Lease]:
+        """Take the right to run a sweep.
+
+        Raises:
+            LockedError: if another process has it.
+            StoreError: if the folder cannot be written to.
+        """
+        folder = make_folder(self.folder(name))
+        with ExitStack() as stack:
+            try:
+                stack.enter_context(locked(_lock_file(folder), f"sweep {name}", PATIENCE_SECONDS))
+            except LockedError as error:
+                holder = read_json(folder / HOLDER)
+                raise LockedError(
+                    f"sweep {name} is being run by process {holder['pid']} on {holder['host']}; "
+                    "wait until it ends, or give this one another name with hydra.launcher.sweep=..."
+                ) from error
+            lease = Lease(folder, uuid.uuid4().hex)
+            write_json(folder / HOLDER, {"token": lease.token, "host": platform.node(), "pid": os.getpid()})
+            yield lease
+
+    def is_running(self, name: str) -> bool:
+        """Whether a living process runs the sweep."""
+        return _is_run(self.folder(name))
 
     def write(self, sweep: Sweep) -> Path:
         """Store a sweep in place of an older one of its name."""
@@ -71,3 +128,11 @@ class Sweeps:
         stored = read_json(self.folder(name) / "sweep.json")
         cells = [Cell(**cell) for cell in stored["cells"]]
         return Sweep(stored["name"], stored["command"], stored["definition"], cells)
+
+
+def _lock_file(folder: Path) -> Path:
+    return folder / ".lock"
+
+
+def _is_run(folder: Path) -> bool:
+    return is_locked(_lock_file(folder))

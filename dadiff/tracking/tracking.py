@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dadiff.errors import ConfigError
-from dadiff.store import Results, StoredRun, Sweep, Sweeps
+from dadiff.store import Cache, Results, StoredRun, Sweep, Sweeps, store_id
 from dadiff.store.files import locked, read_json
 from dadiff.tracking.client import SQLITE, open_client, prepare_store, process_start, spared
 from dadiff.tracking.content import (
@@ -182,13 +182,12 @@ class Tracking:
                     self._client.log_artifact(marker.run_id, str(path), artifact_path)
 
     def close_dead(self, output_dir: Path | str) -> int:
-        """Close as KILLED what still counts as RUNNING though its process on this host is gone. Returns how many."""
+        """Close as KILLED what still counts as RUNNING though its process is gone, on any host. Returns how many."""
         dead: list[Run] = []
         if self.enabled:
             with spared("the end of dead runs"):
-                owner = _owner(output_dir)
-                mine = f"tags.host = '{owner['host']}' and tags.output_dir = '{owner['output_dir']}'"
-                dead = [run for run in self._search(f"attributes.status = 'RUNNING' and {mine}") if _is_dead(run)]
+                running = self._search(f"attributes.status = 'RUNNING' and tags.store = '{store_id(output_dir)}'")
+                dead = [run for run in running if _is_dead(run, output_dir)]
                 for run in dead:
                     self.stop(run.info.run_id, "killed", "its process is gone")
         return len(dead)
@@ -266,9 +265,7 @@ class Tracking:
 
     def _remove_older(self, run_id: str, key: str, kind: str, output_dir: Path) -> None:
         """Delete (MLflow can restore it) the mirror of a result that was done again in its place."""
-        owner = _owner(output_dir)
-        mine = f"tags.host = '{owner['host']}' and tags.output_dir = '{owner['output_dir']}'"
-        same = f"tags.key = '{key}' and tags.kind = '{kind}' and {mine}"
+        same = f"tags.key = '{key}' and tags.kind = '{kind}' and tags.store = '{store_id(output_dir)}'"
         for run in self._search(f"attributes.status = 'FINISHED' and {same}"):
             if run.info.run_id != run_id:
                 self._client.delete_run(run.info.run_id)
@@ -281,11 +278,20 @@ def _owner(output_dir: Path | str) -> dict[str, str]:
         "pid": str(pid),
         "process_start": process_start(pid) or "",
         "output_dir": str(Path(output_dir).absolute()),
+        "store": store_id(output_dir),
         "mlflow.user": getpass.getuser(),
         "mlflow.source.name": "dadiff",
     }
 
 
-def _is_dead(run: Run) -> bool:
+def _is_dead(run: Run, output_dir: Path | str) -> bool:
+    """Whether its process is gone: as this host knows, or, of another host, because nobody holds the work's lock."""
     tags = run.data.tags
-    return process_start(int(tags["pid"])) != tags["process_start"]
+    if tags["host"] == platform.node():
+        return process_start(int(tags["pid"])) != tags["process_start"]
+    key = tags["key"]
+    if tags["kind"] == "run":
+        return not Results(output_dir).is_working(key)
+    if tags["kind"] == "training":
+        return not Cache(output_dir).is_building("denoiser", key)
+    return not Sweeps(output_dir).is_running(key)
