@@ -35,19 +35,26 @@ EXAMPLE_ROBOTS = 3
 
 @dataclass
 class Timed:
-    """A function that counts its calls and the seconds they take."""
+    """A function that counts its calls and the seconds they take, on an accelerator too."""
 
     function: Callable[..., Any]
+    device: str = "cpu"
     calls: int = 0
     seconds: float = 0.0
 
     def __call__(self, *arguments: Any) -> Any:
         """Call it."""
+        self._wait()
         start = time.perf_counter()
         result = self.function(*arguments)
+        self._wait()
         self.seconds += time.perf_counter() - start
         self.calls += 1
         return result
+
+    def _wait(self) -> None:
+        if self.device != "cpu":
+            torch.cuda.synchronize(self.device)
 
 
 @dataclass
@@ -110,7 +117,8 @@ def draw_plans(experiment: Experiment) -> Plans:
     environment = np.repeat(cases.environment, evaluation.samples, axis=-2)
     projection, measures = projection_of(experiment, np.repeat(cases.x_init, evaluation.samples, axis=-2))
     _check_enforcement(parts["enforcement"], projection)
-    project = Timed(projection.map(lambda a: torch.as_tensor(a, device=experiment.device))) if projection else None
+    device = experiment.device
+    project = Timed(projection.map(lambda a: torch.as_tensor(a, device=device)), device) if projection else None
     denoiser = experiment.denoiser  # after the projection, which may refuse what it is given
     chain, snapshots = _observers(experiment, environment)
     watch = Timed(lambda *seen: [observe(*seen) for observe in (chain, snapshots) if observe])

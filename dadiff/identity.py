@@ -22,7 +22,11 @@ FORMAT = 1  # raised whenever a change moves results; see CHANGELOG
 
 @dataclass(frozen=True)
 class Artefact:
-    """A cached thing: its kind ("demonstrations", "cases", "denoiser"), what determines it, and the hash of that."""
+    """Something shared by runs: its kind, what determines it, and the hash of that.
+
+    Args:
+        kind: "demonstrations", "cases" or "denoiser", which are cached; or "recording", which is cheap.
+    """
 
     kind: str
     determined_by: dict[str, Any]

@@ -12,11 +12,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dadiff.errors import ConfigError
+
 if TYPE_CHECKING:
     import torch
 
 
 def _sequence(seed: int, role: str) -> np.random.SeedSequence:
+    if seed < 0:
+        raise ConfigError(f"seed of {role}: is {seed}; it must not be negative")
     return np.random.SeedSequence(entropy=seed, spawn_key=(zlib.crc32(role.encode()),))
 
 

@@ -144,6 +144,7 @@ BAD = {
     "state_dim": ({"states": np.zeros((7, 3))}, r"array states has shape (7, 3); expected (7, 4)"),
     "input_dim": ({"inputs": np.zeros((6, 1))}, r"array inputs or controls has shape (6, 1); expected (6, 2)"),
     "dimensions": ({"initial_state": np.zeros((1, 4))}, r"array initial_state has shape (1, 4); expected (4)"),
+    "start": ({"initial_state": np.ones(4)}, "initial_state is [1.0, 1.0, 1.0, 1.0], but states begin at ["),
     "text": ({"states": np.array([["a"] * 4] * 7)}, "array states holds <U1; expected real numbers"),
     "complex": ({"states": np.zeros((7, 4), complex)}, "array states holds complex128; expected real numbers"),
     "times": ({"states": np.zeros((7, 4), "datetime64[s]")}, "array states holds datetime64[s]; expected real numbers"),
@@ -276,6 +277,9 @@ def test_a_fleet_has_a_folder_a_robot(tmp_path):
         NpzRecordings(str(tmp_path)).record(robots)
     record(tmp_path / "robot_1", "a.npz", seed=1)
     assert NpzRecordings(str(tmp_path)).record(robots).inputs.shape == (2, 1, 60, 2)
+    before = NpzRecordings(str(tmp_path)).fingerprint()
+    record(tmp_path / "robot_1", "a.npz", seed=2)
+    assert NpzRecordings(str(tmp_path)).fingerprint() != before
 
 
 def test_a_missing_folder_of_recordings_is_named(tmp_path):

@@ -107,10 +107,21 @@ def test_snapshots_run_from_noise_to_the_plan():
         for stage in ("predict", "project"):
             snapshots(j, stage, torch.full((2, 3), float(j)))
     steps, plans = snapshots.stacked()
-    assert list(steps) == snapshots.steps == sorted(set(steps), reverse=True)
+    assert list(steps) == snapshots.steps[1:]  # noise itself is no step that is reached
     assert steps[-1] == 0
     assert (plans[-1] == 0).all()
     assert plans.shape == (len(steps), 3)
+
+
+def test_snapshots_of_a_short_chain_bear_the_steps_that_it_visits():
+    snapshots = Snapshots(np.linspace(1, 0, 1001), (0,))
+    for j in range(900, -1, -100):
+        snapshots(j, "project", torch.full((1, 3), float(j)))
+    snapshots(0, "end", torch.full((1, 3), -1.0))
+    steps, plans = snapshots.stacked()
+    assert len(set(steps)) == len(steps) > 3
+    np.testing.assert_array_equal(plans[:-1, 0], steps[:-1])
+    assert (steps[-1], plans[-1, 0]) == (0, -1)
 
 
 @pytest.mark.parametrize(

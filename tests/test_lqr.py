@@ -200,6 +200,7 @@ def test_the_cost_ratio_is_1_at_the_optimum_and_more_elsewhere(system, rng):
         {"horizon": 0},
         {"state_cost": (1.0, -1.0, 1.0, 1.0)},
         {"state_cost": (1.0, float("nan"), 1.0, 1.0)},
+        {"state_cost": (0.0, 0.0, 0.0, 0.0)},
         {"input_cost": 0.0},
         {"input_cost": float("nan")},
         {"init_range": -1.0},

@@ -122,7 +122,8 @@ def test_bad_environments_are_named_in_one_line(
         ("broken.yaml", b"- {x_init: [", "not readable as yaml"),
         ("mapping.yaml", b"x_init: 1", "expected a list of environments; found dict"),
         ("empty.yaml", b"[]", "holds no environment"),
-        ("broken.npz", b"PK", "not readable as npz"),
+        ("broken.npz", b"PK", "is not a readable .npz file"),
+        ("array.npz", b"\x93NUMPY", "is not a readable .npz file"),
     ],
 )
 def test_unusable_files_are_named_in_one_line(tmp_path: Path, name: str, content: bytes | None, message: str) -> None:
@@ -141,6 +142,9 @@ def test_npz_with_missing_or_misshapen_arrays_is_refused(tmp_path: Path) -> None
         load_environments(path, Obstacles())
     np.savez(path, x_init=np.zeros((2, 4)), target=np.zeros((3, 2)))
     with pytest.raises(DataError, match="different numbers of environments"):
+        load_environments(path, Obstacles())
+    np.savez(path, x_init=0.0, target=np.zeros((1, 2)))
+    with pytest.raises(DataError, match="x_init is a single number"):
         load_environments(path, Obstacles())
     np.savez(path, x_init=np.zeros((2, 4)), target=np.ones((2, 2)), obstacles=np.zeros((2, 3)))
     with pytest.raises(DataError, match=r"obstacles has shape \(2, 3\)"):

@@ -131,6 +131,7 @@ def test_more_obstacles_than_a_model_has_slots_for_are_refused(cases: Cases) -> 
         ({"horizon": 1}, "horizon is 1"),
         ({"margin": -0.1}, "margin is -0.1"),
         ({"input_cost": 0.0}, "input_cost is 0.0"),
+        ({"box": 0.3}, "box is 0.3"),
         ({"waypoint_times": [33, 5]}, "waypoint_times are"),
         ({"waypoint_times": [5, 40]}, "waypoint_times are"),
         ({"waypoint_times": [5, 9, 33]}, "max_waypoints is 2"),
@@ -263,3 +264,10 @@ def test_a_bounded_printed_cost_is_solved_to_its_minimum() -> None:
         moved = found.positions + (G @ (0.02 * rng.normal(size=(problem.horizon - 1, 2))))[None]
         assert literal.cost(problem, moved)[0] >= found.cost[0]
     np.testing.assert_allclose(found.positions[:, :2], problem.start, atol=1e-12)
+
+
+def test_plans_are_not_priced_against_the_printed_cost() -> None:
+    task = Obstacles(formulation="literal", waypoint_weight=1000.0, input_cost=1.0)
+    cases = task.cases(SYSTEM, 2, np.random.default_rng(0))
+    plans = cases.reference[:, None]
+    assert "cost_ratio" not in task.score(SYSTEM, cases, plans, plans).per_plan

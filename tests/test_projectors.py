@@ -202,6 +202,18 @@ def test_known_is_F_times_its_pseudo_inverse(system):
     )
 
 
+@pytest.mark.parametrize("initial_state", ["free", "fixed"])
+@pytest.mark.parametrize(("A", "T"), [(2.0, 60), (3.0, 700)])
+def test_known_holds_where_the_powers_of_A_overflow_every_digit(A, T, initial_state):
+    system = LinearSystem(np.array([[A]]), np.ones((1, 1)))
+    layout, z = system.layout(T), np.random.default_rng(0).standard_normal((3, 2 * T + 1))
+    fitted = Known(initial_state).fit(layout, system=system)
+    x, u = layout.split(fitted.projection(x_init=np.ones((3, 1)))(z))
+    assert np.abs(x[:, 1:] - A * x[:, :-1] - u).max() < 1e-12
+    if initial_state == "fixed":
+        np.testing.assert_allclose(x[:, 0], 1, atol=1e-12)
+
+
 # --- recordings that are noisy, short or poor
 
 

@@ -14,6 +14,7 @@ from laws import SYSTEMS, component, presets, tolerance, variants
 
 from dadiff.denoisers.exact import ExactDenoiser
 from dadiff.diffusion.chain import Samples, sample
+from dadiff.diffusion.enforcement import PostHoc
 from dadiff.diffusion.samplers import DDIM, DDPM, skipped_weight
 from dadiff.diffusion.schedule import Schedule, cosine, paper_linear
 from dadiff.errors import ConfigError
@@ -254,6 +255,16 @@ def test_a_chain_stops_where_a_value_leaves_the_bound():
     stopped = run(500.0)
     assert stopped.diverged_at > 10
     assert stopped.network_calls == 20 - stopped.diverged_at + 1
+
+
+def test_a_projection_at_the_end_that_leaves_the_bound_is_seen():
+    seen = []
+    samples = sample(
+        DDIM(5), cosine(20), lambda tau, i, environment: torch.zeros_like(tau), torch.zeros(2, 1), (2, 5),
+        torch_generator(0, "x"), lambda tau: tau + 1e12, PostHoc(), lambda j, stage, tau: seen.append((j, stage)),
+    )  # fmt: skip
+    assert samples.diverged_at == 0
+    assert seen[-2:] == [(0, "project"), (0, "end")]
 
 
 @pytest.mark.parametrize(

@@ -98,6 +98,9 @@ def test_undefined_entries_carry_no_weight(rng):
     assert st.mean(values, weights).value == pytest.approx(2)
     assert np.nanmax(st.resampled_means(values, weights)) <= 3 + 1e-12
     assert 1 <= st.interquartile_mean(values, weights).value <= 3
+    for statistic in (st.mean, st.interquartile_mean):
+        nothing = statistic(np.full_like(values, np.nan), weights)
+        assert np.isnan([nothing.value, nothing.low, nothing.high]).all()
 
 
 def test_the_same_generator_gives_the_same_interval():

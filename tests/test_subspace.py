@@ -49,5 +49,5 @@ def test_the_distance_is_that_of_the_projectors(rng):
     difference = U @ U.swapaxes(-1, -2) - V @ V.swapaxes(-1, -2)
     expected = np.linalg.norm(difference, axis=(-2, -1)) / np.sqrt(8)
     np.testing.assert_allclose(projector_distance(U, V), expected, rtol=1e-12)
-    assert projector_distance(U, U).max() < 1e-7
+    assert projector_distance(U, U).max() < 1e-15
     np.testing.assert_allclose(projector_distance(np.eye(6)[:, :3], np.eye(6)[:, 3:]), 1)

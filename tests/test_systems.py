@@ -29,15 +29,6 @@ def test_zero_order_hold_is_the_matrix_exponential(axes):
     np.testing.assert_allclose(system.B, exact[: 2 * axes, 2 * axes :], atol=1e-14)
 
 
-def test_the_process_noise_has_its_deviation(rng):
-    w = double_integrator(process_noise=0.05).sample_noise(rng, (4000,))
-    assert w.shape == (4000, 4)
-    np.testing.assert_allclose(w.std(axis=0), 0.05, rtol=0.05)
-    per_state = LinearSystem(np.eye(2), np.ones((2, 1)), np.array([0.0, 3.0])).sample_noise(rng, (4000,))
-    assert (per_state[:, 0] == 0).all()
-    np.testing.assert_allclose(per_state[:, 1].std(), 3, rtol=0.05)
-
-
 @pytest.mark.parametrize(
     ("A", "B", "message"),
     [

@@ -13,12 +13,14 @@ radius; a slot whose three numbers are all nan is empty. Waypoints and obstacles
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from dadiff.datasets.files import UNREADABLE
 from dadiff.errors import DataError
 from dadiff.tasks.environments import Environments, check, encode, join
 from dadiff.tasks.obstacles import Obstacles
@@ -64,15 +66,19 @@ def _from_yaml(path: Path) -> list[Any]:
 
 
 def _from_npz(path: Path) -> list[Any]:
+    if not zipfile.is_zipfile(path):
+        raise DataError(f"{path}: is not a readable .npz file; write it with numpy.savez")
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
-    except (OSError, ValueError, EOFError) as error:
+    except UNREADABLE as error:
         raise DataError(f"{path}: not readable as npz: {' '.join(str(error).split())}") from error
     for name in _REQUIRED:
         if name not in arrays:
             raise DataError(f"{path}: '{name}' is missing; expected arrays {', '.join(_REQUIRED + _OPTIONAL)}")
-    lengths = {name: len(np.atleast_1d(a)) for name, a in arrays.items()}
+    if flat := [name for name, a in arrays.items() if a.ndim == 0]:
+        raise DataError(f"{path}: {flat[0]} is a single number; expected one row for each environment")
+    lengths = {name: len(a) for name, a in arrays.items()}
     if len(set(lengths.values())) > 1:
         raise DataError(f"{path}: arrays hold different numbers of environments: {lengths}")
     slots = {name: arrays.pop(name) for name in _OPTIONAL if name in arrays}

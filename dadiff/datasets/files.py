@@ -131,6 +131,9 @@ class NpzTrajectories:
         states = np.stack([read_array(f, ["states"], (T + 1, n)) for f in files])
         inputs = np.stack([read_array(f, INPUT_NAMES, (T, m)) for f in files])
         ends = [[read_array(f, [name], (n,)) for name in ("initial_state", "target_state")] for f in files]
+        for file, (start, _), first in zip(files, ends, states[:, 0], strict=True):
+            if not np.allclose(start, first, rtol=1e-4, atol=1e-6):
+                raise DataError(f"{file}: initial_state is {start.tolist()}, but states begin at {first.tolist()}")
         return system.layout(T).flatten(states, inputs), np.array(ends).reshape(len(files), 2 * n)
 
 
@@ -148,7 +151,8 @@ class NpzRecordings:
 
     def fingerprint(self) -> str:
         """What the folder holds, in place of where it lies."""
-        list_files(Path(self.path))
+        if not any(Path(self.path).glob("robot_*/*.npz")):
+            list_files(Path(self.path))
         return fingerprint(Path(self.path))
 
     def record(self, system: LinearSystem) -> Recording:

@@ -18,7 +18,7 @@ class Generated:
     """Fresh environments, solved by the task's expert.
 
     Args:
-        train_size: number of demonstrations.
+        train_size: number of demonstrations (a robot).
         test_size: number of test cases (a robot).
         seed: of the environments and the process noise.
     """

@@ -60,7 +60,8 @@ class NetworkDenoiser(nn.Module):
 
     def standardise_by(self, environment: np.ndarray) -> None:
         """Scale E by the mean and deviation of a training set's (N, c); what never varies keeps its unit."""
-        mean, deviation = environment.mean(axis=0), environment.std(axis=0)
+        varies = np.ptp(environment, axis=0) > 0  # rounding gives a constant a deviation, too
+        mean, deviation = environment.mean(axis=0), np.where(varies, environment.std(axis=0), 0.0)
         if isinstance(self.network, RecordingNetwork):
             mean, deviation = self.network.tied(mean), self.network.tied(deviation)
         self.environment_mean.copy_(torch.from_numpy(mean))

@@ -293,6 +293,8 @@ def _check_data(layout: Layout, trajectories: np.ndarray, environment: np.ndarra
             f"training: trajectories have shape {trajectories.shape} and environments {environment.shape}; "
             "expected (N, d) and (N, c)"
         )
+    if not len(trajectories):
+        raise DataError("training: there are no demonstrations; raise dataset.train_size, or see why none was solved")
     for name, array in (("trajectories", trajectories), ("environments", environment)):
         if not np.isfinite(array).all():
             raise DataError(f"training: the {name} hold values that are not finite; check where they come from")

@@ -15,7 +15,8 @@ from dadiff.diffusion.schedule import Schedule
 
 Tensor = torch.Tensor
 Denoise = Callable[[Tensor, int, Tensor], Tensor]
-Observe = Callable[[int, Literal["predict", "project"], Tensor], None]
+Stage = Literal["predict", "project", "end"]
+Observe = Callable[[int, Stage, Tensor], None]
 
 
 @dataclass(frozen=True)
@@ -25,7 +26,7 @@ class Samples:
     Args:
         tau: plans (*robots, ..., d) in the sampler's coordinates.
         network_calls: how often the denoiser was called.
-        diverged_at: the step at which a value left the bound or float range, or None.
+        diverged_at: the step at which a value left the bound or float range, 0 for the end; or None.
     """
 
     tau: Tensor
@@ -55,7 +56,7 @@ def sample(
         shape: (*robots, ..., d) of the plans.
         generator: of all noise; on the CPU, so that the same seed gives the same noise on every device.
         project, enforcement: P and where it acts; None for vanilla diffusion.
-        observe: is shown the sample after each prediction and after each projection.
+        observe: is shown the sample after each prediction, after each projection, and after the end's.
         divergence_bound: the chain stops once max |tau| exceeds it.
         progress: show a progress bar.
 
@@ -87,4 +88,6 @@ def sample(
             return Samples(tau, calls, diverged_at=step.i)
     if project and enforcement:
         tau = enforcement.end(tau, project)
-    return Samples(tau, calls)
+        if observe:
+            observe(0, "end", tau)
+    return Samples(tau, calls, diverged_at=None if tau.abs().max() <= divergence_bound else 0)

@@ -48,7 +48,7 @@ class DDPM:
         last_step_noise: as in Algorithm 1, which adds sqrt(beta_1) eps to the final plan too.
         variance: sigma_i^2 is beta_i (the paper's) or the posterior's beta_i (1 - alpha_bar_{i-1}) / (1 - alpha_bar_i).
         skip_below: bound on the total weight of the clean estimates that are not computed: the sample at the first
-            call differs by at most skip_below * max |tau0_hat|. 0 leaves out calls of no weight only.
+            call differs by at most skip_below * max |tau0_hat|_2, projected or not. 0 leaves out calls of no weight.
     """
 
     last_step_noise: bool = True

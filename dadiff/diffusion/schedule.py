@@ -93,6 +93,8 @@ def ddpm_linear(num_steps: int = 1000, beta_first: float = 1e-4, beta_last: floa
 
 def cosine(num_steps: int = 1000, offset: float = 0.008, beta_max: float = 0.999) -> Schedule:
     """alpha_bar_i proportional to cos^2((i/L + s)/(1 + s) * pi/2), s = offset (Nichol & Dhariwal 2021)."""
+    if offset < 0:
+        raise ConfigError(f"schedule: offset is {offset}; it must not be negative")
     share = np.concatenate([[0], _steps(num_steps)]) / num_steps
     alpha_bar = np.cos((share + offset) / (1 + offset) * np.pi / 2) ** 2
     return _schedule(np.minimum(1 - alpha_bar[1:] / alpha_bar[:-1], beta_max))

@@ -12,7 +12,8 @@ import pandas as pd
 
 from dadiff.tasks import Scores
 
-Observe = Callable[[int, Literal["predict", "project"], Any], None]
+Stage = Literal["predict", "project", "end"]
+Observe = Callable[[int, Stage, Any], None]
 Distance = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 SHOWN_SIGNAL = (0.0, 0.05, 0.25, 0.5, 0.75, 0.95, 1.0)
@@ -64,8 +65,10 @@ class ChainRecorder:
     rows: list[dict[str, Any]] = field(default_factory=list)
     _last: np.ndarray | None = None
 
-    def __call__(self, j: int, stage: Literal["predict", "project"], tau: Any) -> None:
-        """Record one half-step that reached step j."""
+    def __call__(self, j: int, stage: Stage, tau: Any) -> None:
+        """Record one half-step that reached step j; the end is none."""
+        if stage == "end":
+            return
         on, off = self.distance(self.to_physical(tau[self.plans].cpu().numpy()))
         grew = float("nan") if self._last is None else float((on > self._last * (1 + 1e-9)).mean())
         self.rows.append({"i": j, "stage": stage, "on_support": on.mean(), "off_support": off.mean(), "grew": grew})
@@ -88,6 +91,7 @@ class Snapshots:
     alpha_bar: np.ndarray
     plan: tuple[int, ...]
     taken: dict[int, np.ndarray] = field(default_factory=dict)
+    _last: float = float("inf")
 
     @property
     def steps(self) -> list[int]:
@@ -95,12 +99,12 @@ class Snapshots:
         signal = np.sqrt(self.alpha_bar)
         return sorted({int(np.abs(signal - s).argmin()) for s in SHOWN_SIGNAL}, reverse=True)
 
-    def __call__(self, j: int, stage: Literal["predict", "project"], tau: Any) -> None:
-        """Keep the plan after projection, the nearest visited step at or below each shown one."""
-        if stage == "project":
-            for step in self.steps:
-                if j <= step and step not in self.taken:
-                    self.taken[step] = tau[self.plan].cpu().numpy().copy()
+    def __call__(self, j: int, stage: Stage, tau: Any) -> None:
+        """Keep the plan after projection, at the first visited step at or below each shown one."""
+        if stage != "predict":
+            if j == 0 or any(j <= step < self._last for step in self.steps):
+                self.taken[j] = tau[self.plan].cpu().numpy().copy()
+            self._last = j
 
     def stacked(self) -> tuple[np.ndarray, np.ndarray]:
         """(steps, plans (k, d)), in the order of the chain."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -59,13 +60,13 @@ class RayPool(Pool[RayTask]):
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
         try:
             with environment(thread_limits(threads)):
-                ray.init(address or "local", include_dashboard=False, log_to_driver=False, logging_level="error")
+                ray.init(address or "local", include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
         except ConnectionError as error:
             raise ConfigError(f"hydra.launcher: no Ray cluster answers at address {address}") from error
         cores = int(ray.cluster_resources().get("CPU", 1))
         super().__init__(workers or max(1, cores // threads), threads, time_limit)
         self._ray, self._lease = ray, lease
-        self._perform = ray.remote(num_cpus=threads, max_retries=0, max_calls=1)(perform)
+        self._perform: Any = ray.remote(num_cpus=threads, max_retries=0, max_calls=1)(perform)
 
     def run(self, works: Sequence[Work], observer: Observer) -> dict[str, Outcome]:
         """Run everything, and leave the cluster."""

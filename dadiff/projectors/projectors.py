@@ -15,10 +15,10 @@ from dadiff.errors import ConfigError, ExcitationError
 from dadiff.projectors.sets import AdmissibleSet, InitialState, Projection, Rollout
 from dadiff.systems import LinearSystem, Recording
 from dadiff.trajectory.coordinates import Coordinates
-from dadiff.trajectory.hankel import trajectory_matrix
+from dadiff.trajectory.hankel import identity_length, trajectory_matrix
 from dadiff.trajectory.layout import Layout
-from dadiff.trajectory.response import trajectory_map
-from dadiff.trajectory.subspace import column_basis, numerical_rank, rank_tolerance
+from dadiff.trajectory.response import dynamics_matrix, trajectory_map
+from dadiff.trajectory.subspace import null_space, numerical_rank, rank_tolerance
 
 Given = TypeVar("Given")
 
@@ -91,8 +91,8 @@ class Hankel:
         if rank == layout.size and not self.allow_identity:
             raise ExcitationError(
                 f"projector hankel: {recording.count} x S = {recording.length} noisy columns span all d = "
-                f"{layout.size} dimensions, so H H† is the identity and projects nothing; use hankel_lowrank, a "
-                "shorter recording, or projector.allow_identity=true"
+                f"{layout.size} dimensions, so H H† is the identity and projects nothing; use hankel_lowrank, "
+                f"S < {identity_length(layout, recording.count)}, or projector.allow_identity=true"
             )
         return AdmissibleSet(layout, U[..., :rank], notes=_notes(s, rank)).starting(self.initial_state)
 
@@ -167,7 +167,7 @@ def identify(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _image_of_dynamics(A: np.ndarray, B: np.ndarray, layout: Layout) -> AdmissibleSet:
-    basis = column_basis(trajectory_map(A, B, layout.horizon))
+    basis = null_space(dynamics_matrix(A, B, layout.horizon))
     return AdmissibleSet(layout, basis, notes={"rank": layout.rank})
 
 

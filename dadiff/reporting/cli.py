@@ -20,6 +20,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--definition", help="which report to write (default: the one made for the sweep)")
     parser.add_argument("--out", type=Path, help="folder to write (default: <output-dir>/reports/<sweep>)")
     parser.add_argument(
+        "--publish", type=Path, help="folder to copy numbers, configurations and SVG figures to, for version control"
+    )
+    parser.add_argument(
         "--tracking-uri", help="read an MLflow parent run or experiment of that name from there instead"
     )
     return parser
@@ -58,7 +61,7 @@ def _write(options: argparse.Namespace, source: Path) -> Path:
     from dadiff.reporting.aggregation import Evidence
     from dadiff.reporting.claims import read_ledger
     from dadiff.reporting.definitions import FOLDER, for_sweep, load
-    from dadiff.reporting.render import render
+    from dadiff.reporting.render import publish, render
     from dadiff.reporting.report import build
     from dadiff.reporting.sources import read_sweeps
 
@@ -66,7 +69,10 @@ def _write(options: argparse.Namespace, source: Path) -> Path:
     definition = load(options.definition) if options.definition else for_sweep(sweep.name)
     command = f"dadiff-report {' '.join(options.sweep)} --definition {definition.name}"
     report = build(definition, Evidence(sweep), read_ledger(FOLDER / "claims.yaml"), command)
-    return render(report, options.out or options.output_dir / "reports" / sweep.name)
+    index = render(report, options.out or options.output_dir / "reports" / sweep.name)
+    if options.publish:
+        publish(index.parent, options.publish)
+    return index
 
 
 if __name__ == "__main__":

@@ -1,4 +1,5 @@
-"""Writes a report: index.html with figures inlined, tables as csv and tex, figures as files, and report.json.
+"""Writes a report: index.html with figures inlined, tables as csv and tex, figures as files, report.json and
+configurations.yaml.
 
 The same report gives the same bytes: nothing says when it was written.
 """
@@ -8,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +19,7 @@ import numpy as np
 from markupsafe import Markup, escape
 
 from dadiff.errors import StoreError
-from dadiff.reporting import labels
+from dadiff.reporting import configurations, labels
 from dadiff.reporting.definitions import FOLDER
 from dadiff.reporting.figures.style import INK
 from dadiff.reporting.figures.style import render as render_figure
@@ -28,6 +30,7 @@ from dadiff.reporting.tables import to_csv
 from dadiff.store.files import make_folder, strict
 
 FORMAT = 1
+PUBLISHED = ("report.json", "configurations.yaml", "tables/*.csv", "figures/*.svg")
 WIDE, NARROW = 2, 1
 """Columns of panels on a page or screen, and on a phone."""
 
@@ -47,10 +50,24 @@ def render(report: Report, folder: Path) -> Path:
             for form, content in drawing.files.items():
                 (folder / "figures" / f"{name}.{form}").write_bytes(content)
         (folder / "report.json").write_text(json.dumps(numbers(report), indent=1, allow_nan=False) + "\n", "utf-8")
+        (folder / "configurations.yaml").write_text(configurations.to_yaml(report.evidence.sweep), "utf-8")
         (folder / "index.html").write_text(to_html(report, drawings), "utf-8")
     except OSError as error:
         raise StoreError(f"{folder}: cannot be written ({error.strerror}); choose another --out") from None
     return folder / "index.html"
+
+
+def publish(report: Path, folder: Path) -> None:
+    """Copy of a report's folder what is worth keeping under version control: numbers, configurations, figures as SVG.
+
+    Raises:
+        StoreError: if the folder cannot be written to.
+    """
+    for part in PUBLISHED:
+        for path in sorted(report.glob(part)):
+            target = folder / path.relative_to(report)
+            make_folder(target.parent)
+            shutil.copyfile(path, target)
 
 
 @dataclass(frozen=True)

@@ -98,9 +98,11 @@ def mean(values: np.ndarray, weights: np.ndarray) -> Estimate:
 
 
 def interquartile_mean(values: np.ndarray, weights: np.ndarray) -> Estimate:
-    """Mean of the middle half of values (*levels,), entries weighted equally (Agarwal et al. 2021)."""
+    """Mean of the middle half of values (*levels,), entries weighted equally (Agarwal et al. 2021); nan if all are."""
     _check(values, weights)
     defined = ~np.isnan(values.ravel())
+    if not defined.any():
+        return Estimate(*[float("nan")] * 3)
     ordered, weights = values.ravel()[defined], weights.reshape(len(weights), -1)[:, defined]
     order = np.argsort(ordered, kind="stable")
     equal = np.full((1, ordered.size), 1 / ordered.size)

@@ -61,8 +61,10 @@ class Ranges:
 
     def __post_init__(self) -> None:
         for name, bounds in self.bounds.items():
-            if len(bounds) != 2 or not bounds[0] <= bounds[1]:
-                raise ConfigError(f"system: the range of {name} is {list(bounds)}; expected [low, high], low <= high")
+            if len(bounds) != 2 or not -np.inf < bounds[0] <= bounds[1] < np.inf:
+                raise ConfigError(
+                    f"system: the range of {name} is {list(bounds)}; expected [low, high], low <= high, both finite"
+                )
 
     @property
     def low(self) -> np.ndarray:

@@ -69,10 +69,6 @@ class LinearSystem:
         """States (*robots, ..., T+1, n) of a roll-out; without noise unless it is given."""
         return simulate(self.A, self.B, x_init, inputs, noise)
 
-    def sample_noise(self, rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
-        """w of shape (*shape, n)."""
-        return self.process_noise * rng.standard_normal((*shape, self.state_dim))
-
 
 def _stacked(matrices: object, name: str) -> np.ndarray:
     """One array from a matrix, an array of them, or a list of one a robot."""

@@ -50,6 +50,8 @@ class LQR:
         for name in ("init_range", "target_range"):
             if not 0 <= (value := getattr(self, name)) < np.inf:
                 raise ConfigError(f"task: {name} is {value}; it must be finite and not negative")
+        if self.state_cost and not any(self.state_cost):
+            raise ConfigError("task: state_cost is 0 for every state, so every optimum costs nothing; raise one")
         if self.init_range == self.target_range == 0:
             raise ConfigError("task: init_range and target_range are both 0, so every optimum costs nothing; widen one")
 

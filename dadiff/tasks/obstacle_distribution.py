@@ -15,7 +15,7 @@ from dadiff.errors import InfeasibleError
 from dadiff.tasks.environments import Environments, join
 
 _DRIFT = 0.75  # metres around p_0 + t v_0 for early waypoints
-_ANNULUS = (0.5, 2.0)  # metres from the target for late waypoints
+ANNULUS = (0.5, 2.0)  # metres from the target for late waypoints
 _ASIDE = 0.35  # metres, deviation along the path's normal of discs put on it
 _CLEAR_OF_POINTS, _CLEAR_OF_DISCS = 0.15, 0.3  # metres beyond the (inflated) radii
 _REDRAWS, _ROUNDS = 100, 20  # of one centre; of environments that found no place for one
@@ -111,7 +111,7 @@ class ObstacleDistribution:
         """In the annulus around the target, inside the box."""
         result, pending = np.empty_like(target), np.arange(len(target))
         while len(pending):
-            distance, angle = rng.uniform(*_ANNULUS, size=len(pending)), rng.uniform(0, 2 * np.pi, size=len(pending))
+            distance, angle = rng.uniform(*ANNULUS, size=len(pending)), rng.uniform(0, 2 * np.pi, size=len(pending))
             offset = distance * np.stack([np.cos(angle), np.sin(angle)])
             result[pending] = target[pending] + offset.T
             pending = pending[(np.abs(result[pending]) > self.box).any(axis=1)]

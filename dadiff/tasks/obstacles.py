@@ -20,7 +20,7 @@ from dadiff.experts.obstacles.quadratic import obstacle_free
 from dadiff.systems import LinearSystem
 from dadiff.tasks import environments as env
 from dadiff.tasks.environments import Environments
-from dadiff.tasks.obstacle_distribution import ObstacleDistribution
+from dadiff.tasks.obstacle_distribution import ANNULUS, ObstacleDistribution
 from dadiff.tasks.obstacle_scores import collision_scores, side_scores, waypoint_scores
 from dadiff.tasks.task import Cases, Demonstrations, Scores
 
@@ -73,9 +73,13 @@ class Obstacles:
         for name, least in (("horizon", 2), ("max_waypoints", 0), ("max_obstacles", 0), ("margin", 0)):
             if (value := getattr(self, name)) < least:
                 raise ConfigError(f"task: {name} is {value}; it must be at least {least}")
-        for name in ("start_range", "box", "waypoint_weight", "input_cost"):
+        for name in ("start_range", "waypoint_weight", "input_cost"):
             if not (value := getattr(self, name)) > 0:
                 raise ConfigError(f"task: {name} is {value}; it must be positive")
+        if not self.box >= ANNULUS[0]:
+            raise ConfigError(
+                f"task: box is {self.box}; it must be at least {ANNULUS[0]}, which waypoints keep from targets"
+            )
         self._check_sizes()
 
     def _check_sizes(self) -> None:
@@ -174,10 +178,11 @@ class Obstacles:
             named = collisions | waypoint_scores(environments, positions) | side_scores(environments, positions, expert)
             scores.per_plan.update({f"{name}_{suffix}": value for name, value in named.items()})
             scores.per_step[f"inside_{suffix}"] = inside
-        problem = self.problem(environments, time_step_of(system))
-        optimum = problem.cost(expert, layout.inputs(cases.reference))
-        cost = problem.cost(layout.states(rollout)[..., :2], layout.inputs(rollout))
-        scores.per_plan["cost_ratio"] = cost / optimum[:, None]
+        if self.formulation != "literal":  # whose expert minimises another cost, which can be negative
+            problem = self.problem(environments, time_step_of(system))
+            optimum = problem.cost(expert, layout.inputs(cases.reference))
+            cost = problem.cost(layout.states(rollout)[..., :2], layout.inputs(rollout))
+            scores.per_plan["cost_ratio"] = cost / optimum[:, None]
         return scores
 
     def distribution_for(self, time_step: float) -> ObstacleDistribution:

@@ -77,11 +77,11 @@ class Task(Protocol):
         ...
 
     def demonstrations(self, system: LinearSystem, count: int, rng: np.random.Generator) -> Demonstrations:
-        """`count` expert demonstrations in fresh environments."""
+        """`count` expert demonstrations (a robot) in fresh environments."""
         ...
 
     def cases(self, system: LinearSystem, count: int, rng: np.random.Generator) -> Cases:
-        """`count` test cases with references in fresh environments."""
+        """`count` test cases (a robot) with references in fresh environments."""
         ...
 
     def score(self, system: LinearSystem, cases: Cases, planned: np.ndarray, rollout: np.ndarray) -> Scores:

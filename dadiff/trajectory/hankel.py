@@ -18,12 +18,6 @@ def windows(signal: np.ndarray, depth: int) -> np.ndarray:
     return np.moveaxis(np.lib.stride_tricks.sliding_window_view(signal, depth, axis=-2), -1, -2)
 
 
-def block_hankel(signal: np.ndarray, depth: int) -> np.ndarray:
-    """H_depth(signal) of shape (..., k depth, S - depth + 1) from a signal (..., S, k)."""
-    columns = windows(signal, depth)
-    return columns.reshape(*columns.shape[:-2], -1).swapaxes(-1, -2)
-
-
 def minimum_length(layout: Layout, count: int = 1) -> int:
     """The S from which `count` recordings give the n + mT columns that span the dynamics."""
     return layout.horizon - 1 + -(-layout.rank // count)

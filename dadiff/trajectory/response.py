@@ -53,6 +53,18 @@ def trajectory_map(A: np.ndarray, B: np.ndarray, horizon: int) -> np.ndarray:
     return F
 
 
+def dynamics_matrix(A: np.ndarray, B: np.ndarray, horizon: int) -> np.ndarray:
+    """G of shape (..., nT, d) with G tau = [x(t+1) - A x(t) - B u(t)] for t = 0..T-1.
+
+    im F is its kernel. G holds no powers of A, so that the kernel is found well however fast A^t grows.
+    """
+    layout = layout_of(A, B, horizon)
+    unit = np.broadcast_to(np.eye(layout.size), (*A.shape[:-2], layout.size, layout.size))
+    x, u = layout.split(unit)
+    residual = x[..., 1:, :] - along(A, x[..., :-1, :]) - along(B, u)
+    return residual.reshape(*A.shape[:-2], layout.size, -1).swapaxes(-1, -2)
+
+
 def along(M: np.ndarray, vectors: np.ndarray) -> np.ndarray:
     """M v for every vector: M (*robots, a, b) and vectors (*robots, ..., b) give (*robots, ..., a).
 

@@ -39,7 +39,10 @@ def largest_angle(U: np.ndarray, V: np.ndarray) -> np.ndarray:
 
 
 def projector_distance(U: np.ndarray, V: np.ndarray) -> np.ndarray:
-    """|P_U - P_V|_F / sqrt(2 s): 0 for equal images, 1 for orthogonal ones of equal dimension s."""
-    r, s = U.shape[-1], V.shape[-1]
-    overlap = (np.square(U.swapaxes(-1, -2) @ V)).sum(axis=(-2, -1))
-    return np.sqrt(np.maximum(r + s - 2 * overlap, 0) / (2 * s))
+    """|P_U - P_V|_F / sqrt(2 s): 0 for equal images, 1 for orthogonal ones of equal dimension s.
+
+    |P_U - P_V|^2 = |(I - P_V) U|^2 + |(I - P_U) V|^2, which does not cancel where the images are close.
+    """
+    overlap = U.swapaxes(-1, -2) @ V
+    outside = [U - V @ overlap.swapaxes(-1, -2), V - U @ overlap]
+    return np.sqrt(sum(np.square(part).sum(axis=(-2, -1)) for part in outside) / (2 * V.shape[-1]))
