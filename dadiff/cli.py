@@ -34,6 +34,7 @@ def one_run(config: dict[str, Any]) -> None:
         print(f"{identity.key}  {identity.name}")
         return
     parts["tracking"].prepare()
+    parts["tracking"].close_dead(parts.settings.output_dir)
 
     from dadiff.launching.jobs import run
     from dadiff.summary import summary

@@ -13,6 +13,10 @@ class ConfigError(DadiffError):
     """A configuration value is misspelt, of the wrong type, out of range or contradicts another."""
 
 
+class NotApplicableError(ConfigError):
+    """Two choices exclude one another; where a sweep combines everything, that is their result."""
+
+
 class ShapeError(DadiffError):
     """An array does not have the shape that its layout asks for."""
 

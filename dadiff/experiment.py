@@ -18,7 +18,7 @@ import yaml
 from dadiff.assembly import Experiment
 from dadiff.diffusion.chain import Samples, sample
 from dadiff.diffusion.enforcement import Enforcement
-from dadiff.errors import ConfigError
+from dadiff.errors import NotApplicableError
 from dadiff.evaluation import replay, tracking_errors
 from dadiff.evaluation.mahalanobis import MahalanobisDistance
 from dadiff.evaluation.records import ChainRecorder, Snapshots, headline, merged, tables
@@ -140,7 +140,7 @@ def draw_plans(experiment: Experiment) -> Plans:
 
 def _check_enforcement(enforcement: Enforcement, projection: Projection | None) -> None:
     if projection is not None and np.any(projection.offset) and not enforcement.affine:
-        raise ConfigError(
+        raise NotApplicableError(
             "enforcement: literal scales the sample, which is meaningless for an affine set (x(0) held, or coordinates "
             "with a mean); use projector.initial_state=free and coordinates=physical, or another enforcement"
         )

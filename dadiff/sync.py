@@ -11,11 +11,13 @@ from pathlib import Path
 from dadiff.errors import DadiffError
 from dadiff.launching.jobs import tracking_of
 from dadiff.store import DONE, Cache, Results, StoredRun
-from dadiff.tracking import is_tracked
+from dadiff.tracking import Tracking, is_tracked
 
 
 def sync(output_dir: Path, uri: str | None = None) -> tuple[int, int]:
-    """Upload stored runs, and the trainings that they were made with. Returns (uploaded, still missing).
+    """Upload stored runs and the trainings that they were made with, and close what was killed.
+
+    Returns (uploaded, still missing).
 
     Args:
         uri: the store; None takes for each run the one that it was configured with.
@@ -24,19 +26,23 @@ def sync(output_dir: Path, uri: str | None = None) -> tuple[int, int]:
         StoreError: if a store is away.
     """
     before = after = 0
+    stores: dict[str, Tracking] = {}
     runs = [run for run in Results(output_dir) if run.status in DONE and run.record["config"]["tracking"]["enabled"]]
     for run in runs:
-        wanted = uri or tracking_of(run.record["config"]).uri
-        before += is_tracked(run.folder, wanted)
-        _upload(output_dir, run, uri)
-        after += is_tracked(run.folder, wanted)
+        tracking = tracking_of(run.record["config"])
+        if uri is not None:
+            tracking = replace(tracking, uri=uri, parent=None)
+        tracking = replace(stores.setdefault(tracking.uri, tracking), parent=tracking.parent)
+        before += is_tracked(run.folder, tracking.uri)
+        _upload(output_dir, run, tracking)
+        after += is_tracked(run.folder, tracking.uri)
+    for tracking in stores.values():
+        tracking.prepare()
+        tracking.close_dead(output_dir)
     return after - before, len(runs) - after
 
 
-def _upload(output_dir: Path, run: StoredRun, uri: str | None) -> None:
-    tracking = tracking_of(run.record["config"])
-    if uri is not None:
-        tracking = replace(tracking, uri=uri, parent=None)
+def _upload(output_dir: Path, run: StoredRun, tracking: Tracking) -> None:
     if is_tracked(run.folder, tracking.uri):
         return
     tracking.prepare()

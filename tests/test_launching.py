@@ -162,6 +162,16 @@ def test_workers_and_threads_do_not_exceed_the_cores():
     assert ProcessPool(None, threads=cores() + 1).workers == 1
 
 
+def test_an_endless_reason_is_cut_and_hangs_nothing(pool, tmp_path):
+    outcome = pool.run([work(tmp_path, "long", fail_at_length)], Silent())["long"]
+    assert outcome.status == "failed"
+    assert len(outcome.reason) < 3000
+
+
+def fail_at_length() -> None:
+    raise ValueError("x" * 200_000)
+
+
 def test_reasons_tell_memory_from_other_failures():
     assert why(RuntimeError("DefaultCPUAllocator: can't allocate memory: 5 TB"))[0] == "out_of_memory"
     assert why(DataError("a\n b")) == ("failed", "a b")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import hashlib
 import json
@@ -13,16 +14,17 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 import pytest
+import yaml
 from made_up import MadeUp
 
 from dadiff.errors import ConfigError, StoreError
-from dadiff.reporting import cli, labels, latex
+from dadiff.reporting import cli, configurations, labels, latex
 from dadiff.reporting.aggregation import Evidence, case_means, case_scalars, pair, varying
 from dadiff.reporting.definitions import Item, for_sweep, load, names
 from dadiff.reporting.figures.style import COLOURS, MARKERS, RC, looks_of, render
 from dadiff.reporting.report import build
 from dadiff.reporting.selection import matches
-from dadiff.reporting.sources import read_sweeps
+from dadiff.reporting.sources import read_sweeps, without_password
 
 STORE = Path(__file__).parent / "data" / "store"
 EXPECTED = Path(__file__).parent / "data" / "expected"
@@ -33,7 +35,8 @@ SWEEPS = ("lqr_made_up", "hankel_length_made_up", "obstacles_made_up", "fleet_ma
 def report(tmp_path_factory) -> Path:
     """The LQR report, with everything that can go wrong in its sweep."""
     out = tmp_path_factory.mktemp("report")
-    assert cli.main(["lqr_made_up", "--output-dir", str(STORE), "--out", str(out)]) == 0
+    with contextlib.chdir(STORE.parent):
+        assert cli.main(["lqr_made_up", "--output-dir", STORE.name, "--out", str(out)]) == 0
     return out
 
 
@@ -78,7 +81,35 @@ def test_the_same_store_gives_the_same_bytes(tmp_path):
         for folder in folders
     )
     assert first == second
-    assert {path.suffix for path in first} == {".html", ".json", ".csv", ".tex", ".pdf", ".svg", ".png"}
+    assert {path.suffix for path in first} == {".html", ".json", ".csv", ".tex", ".pdf", ".svg", ".png", ".yaml"}
+
+
+def test_what_is_published_is_numbers_configurations_and_drawings(tmp_path):
+    out, published = tmp_path / "out", tmp_path / "published"
+    for folder in (out / "figures", published / "figures"):
+        folder.mkdir(parents=True)
+        (folder / "older.svg").write_text("of another definition")
+    command = ["lqr_made_up", "--output-dir", str(STORE), "--out", str(out), "--publish", str(published)]
+    assert cli.main(command) == 0
+    files = {path.relative_to(published).as_posix() for path in published.rglob("*") if path.is_file()}
+    assert {"report.json", "configurations.yaml", "tables/summary.csv", "figures/errors.svg"} <= files
+    assert {Path(file).suffix for file in files} == {".json", ".yaml", ".csv", ".svg"}
+    assert not (out / "figures" / "older.svg").exists()
+    assert not (published / "figures" / "older.svg").exists()
+    stored = yaml.safe_load((published / "configurations.yaml").read_text())
+    cells = evidence("lqr_made_up").sweep.cells
+    assert stored["cells"].keys() == {cell.key for cell in cells if cell.record}
+    for cell in cells:
+        if cell.record:
+            whole = {**stored["shared"], **stored["cells"][cell.key]}
+            assert whole.pop("run")
+            assert whole == configurations.flat(cell.record["config"])
+
+
+def test_a_password_in_an_address_is_not_shown():
+    shown = without_password("http://user:secret@host:5000/x")
+    assert shown == "http://host:5000/x"
+    assert without_password("sqlite:////a/b@c.db") == "sqlite:////a/b@c.db"
 
 
 def test_the_page_asks_for_nothing_and_knows_no_place(report):
@@ -105,7 +136,11 @@ def test_every_part_says_how_to_make_it_again_and_from_how_much(report):
     content = json.loads((report / "report.json").read_text())
     assert content["commands"][0] == "dadiff +sweeps=lqr_made_up"
     facts = content["figures"]["errors"]["facts"]
-    assert facts.startswith("6 cases, 3 plans a case, 3 training seeds")
+    assert facts.startswith(
+        "3 training seeds, 3 recordings, 6 cases, 3 plans a case. 95 % intervals by a bootstrap over"
+    )
+    assert facts.endswith("seeds, cases, widened for 3 seeds by Student's t.")
+    assert "interval" not in content["figures"]["theorem1"]["facts"]
     page = (report / "index.html").read_text()
     shown = [part for part in (*content["tables"].values(), *content["figures"].values()) if part["runs"]]
     assert page.count("dadiff-report lqr_made_up --definition lqr") == len(shown)

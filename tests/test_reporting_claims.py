@@ -12,8 +12,9 @@ from made_up import MadeUp, chain_table
 
 from dadiff.errors import ConfigError
 from dadiff.reporting.aggregation import Evidence
-from dadiff.reporting.claims import Claim, Verdict, decide, judge, read_ledger
+from dadiff.reporting.claims import Claim, Finding, Verdict, condition, decide, judge, read_ledger
 from dadiff.reporting.definitions import FOLDER, load, names
+from dadiff.reporting.report import build
 from dadiff.reporting.sources import read_sweeps
 from dadiff.reporting.statistics import Estimate
 
@@ -24,13 +25,13 @@ TRUTHS = ("holds", "does not hold", "undecided")
 def concrete(cells: dict[str, Any]) -> dict[str, Any]:
     """Axes of one cell that a selector asks for."""
     axes = {}
-    for axis, condition in cells.items():
-        if isinstance(condition, list):
-            axes[axis] = condition[-1]
-        elif not isinstance(condition, dict):
-            axes[axis] = condition
-        elif "above" in condition:
-            axes[axis] = condition["above"] + 0.01
+    for axis, wanted in cells.items():
+        if isinstance(wanted, list):
+            axes[axis] = wanted[-1]
+        elif not isinstance(wanted, dict):
+            axes[axis] = wanted
+        elif "above" in wanted:
+            axes[axis] = wanted["above"] + 0.01
     axes.setdefault("projector", "known")
     return {name.replace(".", "__"): value for name, value in axes.items()}
 
@@ -59,11 +60,12 @@ def level_store(folder: Path, claim: Claim, truth: str) -> MadeUp:
     store = MadeUp(folder)
     bound = target(claim.rule, truth)
     metric = claim.options["metric"]
-    value = (1 + (bound - 1) * 0.1 if truth == "holds" else bound) if metric == "cost_ratio" else bound
+    far = {"holds": 0.1}.get(truth, 1)
+    value = 1 + (bound - 1) * far if metric == "cost_ratio" else bound * far
     for seed in range(3):
         off = {"undecided": (0.3, 1.0, 1.7)[seed]}.get(truth, 1)
         scaled = 1 + (value - 1) * off if metric == "cost_ratio" else value * off
-        store.run(levels={metric: scaled}, per_plan={metric: scaled}, seed=seed, spread=0.3, **concrete(claim.cells))
+        store.run(levels={metric: scaled}, per_plan={metric: scaled}, seed=seed, spread=0.1, **concrete(claim.cells))
     return store
 
 
@@ -187,6 +189,64 @@ def test_failed_and_missing_cells_decide_nothing_and_are_named(tmp_path):
     verdict = judged(store, claim)
     assert verdict.verdict == "holds"
     assert verdict.unavailable == {"Hankel HH†": "failed: out of memory"}
+
+
+def test_a_verdict_from_a_part_of_the_seeds_says_so(tmp_path):
+    store, claim = MadeUp(tmp_path, cases=40), LEDGER["fig2_significantly"]
+    for seed in range(3):
+        store.run(1.0, seed=seed)
+    store.run(0.2, seed=0, projector="known", enforcement="normalised")
+    store.run(status="failed", reason="out of memory", seed=1, projector="known", enforcement="normalised")
+    store.run(stored=False, seed=2, projector="known", enforcement="normalised")
+    verdict = judged(store, claim)
+    assert "(1 of 3 replicates: failed: out of memory; missing)" in verdict.lines[0]
+    assert len(verdict.runs) == 2  # the pair that was compared
+
+
+def test_runs_of_different_seeds_are_not_compared(tmp_path):
+    store = MadeUp(tmp_path)
+    store.run(1.0, seed=0)
+    store.run(0.2, seed=1, projector="known", enforcement="normalised")
+    assert judged(store, LEDGER["fig2_state"]).verdict == "not tested here"
+    for name in names():
+        build(load(name), Evidence(read_sweeps(store.folder, [store.name])), list(LEDGER.values()), "")
+
+
+def test_one_case_decides_nothing(tmp_path):
+    store = MadeUp(tmp_path, cases=1)
+    store.run(1.0)
+    store.run(0.2, projector="known", enforcement="normalised")
+    assert judged(store, LEDGER["fig2_significantly"]).verdict == "undecided"
+
+
+def test_a_single_timing_is_said_to_be_one(tmp_path):
+    store = MadeUp(tmp_path)
+    times = {"projection_seconds": 1e-3, "projection_calls": 20, "sampling_seconds": 1.0}
+    store.run(metrics=times, projector="known", enforcement="normalised")
+    verdict = judged(store, LEDGER["projection_is_cheap"])
+    assert verdict.verdict == "holds"
+    assert verdict.lines == ["so: known FF†: 2 % of the sampling time of one run"]
+
+
+def test_a_chain_without_half_steps_says_nothing(tmp_path):
+    store = MadeUp(tmp_path)
+    store.run(chain=chain_table(20, grows=False).head(0), **concrete(LEDGER["theorem1_prediction"].cells))
+    assert judged(store, LEDGER["theorem1_prediction"]).verdict == "not tested here"
+
+
+def test_the_condition_does_not_hide_a_true_finding_without_the_axis():
+    estimate = Estimate(1.0, 1.0, 1.0)
+    said = [("vanilla", {"projector": "none"}, True), ("fixed", {"projector": "known", "initial_state": "fixed"}, True),
+            ("free", {"projector": "known", "initial_state": "free"}, False)]  # fmt: skip
+    found = [Finding(label, axes, estimate, true, "", []) for label, axes, true in said]
+    assert condition(found) == "vanilla; fixed"
+
+
+def test_selectors_are_told_in_words(tmp_path):
+    store = MadeUp(tmp_path)
+    store.run(1.0)
+    verdict = judged(store, LEDGER["printed_operator"])
+    assert verdict.lines == ["no cell of this sweep has projector other than vanilla, enforcement as printed"]
 
 
 def test_a_comparison_without_its_baseline_is_not_made(tmp_path):

@@ -22,10 +22,17 @@ def test_weights_are_shares(levels, rng):
     np.testing.assert_allclose(weights.reshape(50, -1).sum(axis=1), 1)
 
 
-def test_a_drawn_seed_brings_a_full_set_of_cases(rng):
+def test_all_seeds_are_tried_on_the_same_drawn_cases(rng):
     weights = st.bootstrap_weights((3, 8), 200, rng)
-    seeds_drawn = weights.sum(axis=2) * 3
-    np.testing.assert_allclose(seeds_drawn, seeds_drawn.round(), atol=1e-12)
+    seeds, cases = weights.sum(axis=2), weights.sum(axis=1)
+    for share, size in ((seeds, 3), (cases, 8)):
+        np.testing.assert_allclose(share * size, (share * size).round(), atol=1e-12)
+    np.testing.assert_allclose(weights, seeds[:, :, None] * cases[:, None], atol=1e-12)
+
+
+def test_other_numbers_of_seeds_leave_the_drawn_cases_alike():
+    few, many = (st.bootstrap_weights((n, 8), 20, np.random.default_rng(0)).sum(axis=1) for n in (2, 5))
+    np.testing.assert_allclose(few, many, atol=1e-12)
 
 
 def test_the_seed_is_the_unit_of_replication(rng):
@@ -49,6 +56,34 @@ def test_intervals_cover(rng):
         estimate = st.mean(values, st.bootstrap_weights((1, 60), 300, rng))
         hits += estimate.low <= 1 <= estimate.high
     assert 0.89 <= hits / 300 <= 0.98
+
+
+@pytest.mark.parametrize(("seeds", "seed_deviation"), [(2, 1.0), (3, 1.0), (3, 0.1), (8, 1.0)])
+def test_intervals_over_few_seeds_on_shared_cases_cover(rng, seeds, seed_deviation):
+    hits = 0
+    for _ in range(300):
+        cases = rng.standard_normal(40)
+        values = 5 + seed_deviation * rng.standard_normal((seeds, 1)) + cases + 0.3 * rng.standard_normal((seeds, 40))
+        estimate = st.difference(values, np.zeros_like(values), st.bootstrap_weights((seeds, 40), 300, rng))
+        hits += estimate.low <= 5 <= estimate.high
+    assert hits / 300 >= 0.91
+
+
+def test_one_entry_leaves_nothing_to_draw_and_gives_no_interval(rng):
+    weights = st.bootstrap_weights((1, 1), 20, rng)
+    estimate = st.mean(np.array([[3.0]]), weights)
+    assert estimate.value == 3
+    assert np.isnan([estimate.low, estimate.high]).all()
+    band = st.simultaneous_band(np.ones((1, 1, 4)), weights)
+    np.testing.assert_array_equal(band.value, 1)
+    assert np.isnan(band.low).all()
+
+
+def test_bounds_of_what_is_positive_stay_positive(rng):
+    values = rng.lognormal(sigma=1.5, size=(2, 30))
+    weights = st.bootstrap_weights((2, 30), 500, rng)
+    assert st.widening(weights) > 8
+    assert 0 < st.mean(values, weights).low < st.mean(values, weights).value
 
 
 def test_the_band_covers_the_whole_curve_where_pointwise_intervals_do_not(rng):
@@ -90,6 +125,11 @@ def test_comparisons_are_paired(rng):
     difference = st.difference(baseline + 1, baseline, weights)
     assert difference.low == pytest.approx(1)
     assert difference.high == pytest.approx(1)
+
+
+def test_entries_that_one_side_lacks_count_in_neither(rng):
+    values, baseline = np.array([[np.nan, 1.0, 1.0, 1.0]]), np.array([[101.0, 1.0, 1.0, 1.0]])
+    assert st.ratio(values, baseline, st.bootstrap_weights((1, 4), 100, rng)).value == 1
 
 
 def test_undefined_entries_carry_no_weight(rng):

@@ -56,6 +56,18 @@ def record(status: str = "finished", key: str = KEY, **more: object) -> dict[str
     return {"key": key, "name": "lqr/known", "status": status, "axes": {"seed": 1}, "metrics": {"gap": 1.5}, **more}
 
 
+def test_a_failure_is_not_written_over_work_in_progress(tmp_path):
+    with Results(tmp_path).working(KEY):
+        run_process(write_a_failure, tmp_path)
+        assert Results(tmp_path).status(KEY) is None
+    run_process(write_a_failure, tmp_path)
+    assert Results(tmp_path).status(KEY) == "killed"
+
+
+def write_a_failure(root: Path) -> None:
+    Results(root).write_failure(record(), "killed", "SIGKILL")
+
+
 def test_eight_processes_on_a_cold_cache_build_once(tmp_path):
     context = multiprocessing.get_context("fork")
     workers = [context.Process(target=get, args=(tmp_path, tmp_path / "log")) for _ in range(8)]
@@ -142,7 +154,7 @@ def test_failures_give_way_to_results_and_not_the_other_way(tmp_path):
     assert results.is_done(KEY)
     results.write_failure(record(), "failed", "later")
     assert results.read(KEY).status == "finished"
-    assert [path.name for path in results.root.iterdir()] == [KEY]
+    assert [path.name for path in results.root.glob("[!.]*")] == [KEY]
 
 
 def test_a_newer_format_is_refused(tmp_path):
@@ -250,3 +262,7 @@ def test_the_cache_tool_lists_verifies_and_prunes(tmp_path, capsys):
     assert "x.npy differs from its checksum" in capsys.readouterr().out
     with Results(tmp_path).working(KEY):
         assert dadiff_cache(["prune", *arguments]) == 1
+    Sweeps(tmp_path).write(Sweep("quick", "dadiff -m", {}, []))
+    with Sweeps(tmp_path).running("quick"):
+        assert dadiff_cache(["prune", *arguments]) == 1
+    assert "sweep quick is being run" in capsys.readouterr().err

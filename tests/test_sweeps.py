@@ -16,7 +16,7 @@ from dadiff.launching import register
 from dadiff.launching.outcome import Outcome, why
 from dadiff.launching.plan import describe, make_plan
 from dadiff.launching.sweep import SweepRun, summary
-from dadiff.store import Cache, Results, Sweeps
+from dadiff.store import DONE, Cache, Results, Sweeps
 from dadiff.sync import sync
 from dadiff.tracking import is_tracked
 from dadiff.tracking.client import open_client
@@ -30,7 +30,7 @@ CELLS = [
     ["projector=known"],
     ["projector=none", "enforcement=normalised"],
     ["projector=none", "enforcement=convex"],  # the same run: nothing is projected
-    ["projector=known", "projector.initial_state=fixed", "enforcement=literal"],  # meaningless together
+    ["projector=identified", "recording=npz", "recording.path={root}/recordings"],  # a damaged file
     ["projector=hankel", "recording.length=20"],  # too short: refused, which is a result
 ]
 
@@ -47,7 +47,10 @@ def root(tmp_path_factory):
 
 def configs(root: Path, cells: Sequence[Sequence[str]] = CELLS) -> list[dict]:
     with initialize_config_dir(str(shipped("conf").absolute()), version_base="1.3"):
-        composed = [compose("config", [*TINY, *cell, f"output_dir={root}"], return_hydra_config=True) for cell in cells]
+        (root / "recordings").mkdir(parents=True, exist_ok=True)
+        (root / "recordings" / "damaged.npz").write_bytes(b"PK")
+        told = [[part.format(root=root) for part in (*TINY, *cell, "output_dir={root}")] for cell in cells]
+        composed = [compose("config", cell, return_hydra_config=True) for cell in told]
         return [plain(config, config.hydra.runtime.choices) for config in composed]
 
 
@@ -91,7 +94,7 @@ def test_what_succeeds_is_stored_and_what_fails_is_recorded_with_its_reason(firs
     run, outcomes = first
     sweep = Sweeps(root).read("quick")
     assert [cell.status for cell in sweep.cells] == ["finished", "finished", "failed", "refused"]
-    assert "literal scales the sample" in sweep.cells[2].reason
+    assert "damaged.npz: is not a readable .npz file" in sweep.cells[2].reason
     failed = Results(root).read(sweep.cells[2].key)
     assert (failed.status, failed.record["reason"]) == ("failed", sweep.cells[2].reason)
     assert [entry.kind for entry in Cache(root).entries()] == ["cases", "demonstrations", "denoiser"]
@@ -118,7 +121,7 @@ def test_mlflow_shows_the_sweep_its_runs_and_the_training(first, root):
 
 def test_a_rerun_does_only_what_failed(first, root):
     run = SweepRun.of(make_plan(configs(root)), "quick", "dadiff", {})
-    assert [cell.identity.name.split("/")[1] for cell in run.plan.waiting] == ["known_fixed"]
+    assert [cell.identity.name.split("/")[1] for cell in run.plan.waiting] == ["identified"]
     assert run.plan.preparations == []
     assert len(run.works(None)) == 1
     assert not run.is_over()
@@ -134,9 +137,17 @@ def test_a_sweep_whose_cells_are_done_is_over(first, root):
     assert len(forced.waiting) == 1
 
 
+def test_choices_that_exclude_one_another_are_refused_as_a_result(root):
+    cells = [["projector=known_fixed", "enforcement=literal"]]
+    run = SweepRun.of(make_plan(configs(root, cells)), "excluding", "dadiff", {})
+    assert [outcome.status for outcome in run_here(run).values()] == ["refused"]
+    assert SweepRun.of(make_plan(configs(root, cells)), "excluding", "dadiff", {}).is_over()
+
+
 def test_sync_uploads_to_another_store_what_is_missing(first, root, tmp_path):
     uri = f"sqlite:///{tmp_path}/other.db"
-    assert sync(root, uri) == (3, 0)
+    done = [run for run in Results(root) if run.status in DONE]
+    assert sync(root, uri) == (len(done), 0)
     assert sync(root, uri) == (0, 0)
     assert all(is_tracked(run.folder, uri) for run in Results(root) if run.status == "finished")
 

@@ -97,7 +97,7 @@ def test_logging_that_was_cut_short_goes_on_in_the_same_run(tracking, tmp_path, 
     with monkeypatch.context() as patch:
         patch.setattr(MlflowClient, "set_terminated", away)
         tracking.log_run(run)
-    assert "dadiff-sync uploads it" in caplog.text
+    assert "dadiff-sync or the same command uploads it" in caplog.text
     assert not is_tracked(run.folder, tracking.uri)
     tracking.log_run(run)
     (mirror,) = runs(tracking)
@@ -186,7 +186,7 @@ def test_a_server_that_is_away_is_an_error_at_the_start_and_a_warning_later(tmp_
     assert time.monotonic() - start < 10
     with caplog.at_level(logging.WARNING):
         tracking.log_run(store(tmp_path))
-    assert "dadiff-sync uploads it" in caplog.text
+    assert "dadiff-sync or the same command uploads it" in caplog.text
 
 
 def test_the_store_is_absolute_and_writes_ahead(tracking, tmp_path, monkeypatch):

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from dadiff.errors import DadiffError, ExcitationError, InfeasibleError
+from dadiff.errors import DadiffError, ExcitationError, InfeasibleError, NotApplicableError
+
+LONGEST_REASON = 2000
+"""Characters; the log has the rest."""
 
 
 @dataclass(frozen=True)
@@ -22,10 +25,10 @@ class Outcome:
 
 def why(error: BaseException) -> tuple[str, str]:
     """The status and reason that an exception stands for."""
-    reason = " ".join(str(error).split())
+    reason = " ".join(str(error).split())[:LONGEST_REASON]
     if isinstance(error, KeyboardInterrupt):
         return "interrupted", "interrupted"
-    if isinstance(error, ExcitationError):
+    if isinstance(error, (ExcitationError, NotApplicableError)):
         return "refused", reason
     if isinstance(error, InfeasibleError):
         return "infeasible", reason

@@ -122,12 +122,13 @@ class SweepRun:
     def _cell(self, planned: PlannedCell, outcomes: Mapping[str, Outcome], unknown: str) -> Cell:
         identity = planned.identity
         outcome = outcomes.get(identity.key)
-        if outcome is not None and outcome.status != "finished":
+        if outcome is not None and outcome.status not in DONE:
             return Cell(identity.key, identity.name, identity.axes, outcome.status, outcome.reason)
         results = Results(self.output_dir)
-        done = results.is_done(identity.key) and (outcome is not None or planned.is_done)
-        status = results.status(identity.key) if done else unknown
-        return Cell(identity.key, identity.name, identity.axes, status or unknown)
+        if not (results.is_done(identity.key) and (outcome is not None or planned.is_done)):
+            return Cell(identity.key, identity.name, identity.axes, unknown)
+        stored = results.read(identity.key)
+        return Cell(identity.key, identity.name, identity.axes, stored.status, stored.record.get("reason"))
 
     def _preparation(self, preparation: Preparation, parent: str | None) -> Work:
         artefact = preparation.artefact

@@ -102,8 +102,11 @@ class Evidence:
         return [method for method in self.all_methods if matches(method.axes, cells)]
 
     def partner(self, method: Method, against: Selector) -> Method | None:
-        """What a method is compared to: the finished method that `against` asks for, alike in all else that applies."""
-        found = [other for other in self.methods(against) if other.finished and _alike(method, other, against)]
+        """What a method is compared to: the method that `against` asks for, alike in all else that applies.
+
+        None if there is none, or if no two of their finished runs are of the same draw.
+        """
+        found = [other for other in self.methods(against) if _alike(method, other, against) and _pairs(method, other)]
         return found[0] if found else None
 
 
@@ -131,11 +134,15 @@ def pair(method: Method, other: Method) -> tuple[list[Cell], list[Cell]]:
     Raises:
         StoreError: if two paired runs were not made on the same cases.
     """
-    pairs = [(a, b) for a in method.finished for b in other.finished if _same_draw(a, b)]
+    pairs = _pairs(method, other)
     for a, b in pairs:
         if a.record["links"].get("cases") != b.record["links"].get("cases"):
             raise StoreError(f"runs {a.key} and {b.key}: their data sets differ, so their cases cannot be paired")
     return [a for a, _ in pairs], [b for _, b in pairs]
+
+
+def _pairs(method: Method, other: Method) -> list[tuple[Cell, Cell]]:
+    return [(a, b) for a in method.finished for b in other.finished if _same_draw(a, b)]
 
 
 def _same_draw(a: Cell, b: Cell) -> bool:

@@ -25,7 +25,7 @@ from dadiff.errors import ConfigError
 from dadiff.reporting.aggregation import Evidence, Method, varying
 from dadiff.reporting.labels import axis_value
 from dadiff.reporting.measures import MEASURES, Measured
-from dadiff.reporting.selection import Selector
+from dadiff.reporting.selection import described
 from dadiff.reporting.statistics import Estimate
 
 BOUNDS = ("above", "below", "at_least", "at_most")
@@ -159,17 +159,17 @@ def _verdict(findings: list[Finding]) -> str:
     if not said:
         return "not tested here"
     if False in said:
-        return f"holds only if {_condition(findings)}" if True in said else "does not hold"
+        return f"holds only if {condition(findings)}" if True in said else "does not hold"
     return "undecided" if None in said else "holds"
 
 
-def _condition(findings: list[Finding]) -> str:
+def condition(findings: list[Finding]) -> str:
     """The axis that tells true findings from false ones, if one does; else the true ones by name."""
     true, false = ([f.axes for f in findings if f.true is wanted] for wanted in (True, False))
     for axis in dict.fromkeys(name for axes in (*true, *false) for name in axes):
         inside, outside = ({repr(axes.get(axis)) for axes in group} for group in (true, false))
         values = list(dict.fromkeys(axes[axis] for axes in true if not isinstance(axes.get(axis), (list, type(None)))))
-        if values and not inside & outside:
+        if len(values) == len(inside) and not inside & outside:
             return " or ".join(axis_value(axis, value) for value in values)
     return "; ".join(finding.label for finding in findings if finding.true)
 
@@ -181,8 +181,4 @@ def _lines(claim: Claim, findings: list[Finding], unavailable: dict[str, str]) -
     for reason in dict.fromkeys(unavailable.values()):
         labels = [label for label, text in unavailable.items() if text == reason]
         lines.append(f"no result ({reason}): {'; '.join(labels)}")
-    return lines or [f"no cell of this sweep has {_asked(claim.cells)}"]
-
-
-def _asked(cells: Selector) -> str:
-    return ", ".join(f"{axis} {value}" for axis, value in cells.items())
+    return lines or [f"no cell of this sweep has {described(claim.cells)}"]

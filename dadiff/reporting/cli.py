@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import logging
+import shlex
 import sys
 import tempfile
 from pathlib import Path
@@ -67,12 +68,23 @@ def _write(options: argparse.Namespace, source: Path) -> Path:
 
     sweep = read_sweeps(source, options.sweep)
     definition = load(options.definition) if options.definition else for_sweep(sweep.name)
-    command = f"dadiff-report {' '.join(options.sweep)} --definition {definition.name}"
-    report = build(definition, Evidence(sweep), read_ledger(FOLDER / "claims.yaml"), command)
+    report = build(definition, Evidence(sweep), read_ledger(FOLDER / "claims.yaml"), _again(options, definition.name))
     index = render(report, options.out or options.output_dir / "reports" / sweep.name)
     if options.publish:
         publish(index.parent, options.publish)
     return index
+
+
+def _again(options: argparse.Namespace, definition: str) -> str:
+    """The command that writes the report again from the same results."""
+    from dadiff.reporting.sources import without_password
+
+    command = ["dadiff-report", *options.sweep, "--definition", definition]
+    if options.output_dir != Path("outputs"):
+        command += ["--output-dir", str(options.output_dir)]
+    if options.tracking_uri is not None:
+        command += ["--tracking-uri", without_password(options.tracking_uri)]
+    return shlex.join(command)
 
 
 if __name__ == "__main__":

@@ -43,9 +43,9 @@ METRICS = {
     "planned_state_error": "state error ‖x(t) − x*(t)‖²",
     "planned_input_error": "control error ‖u(t) − u*(t)‖²",
     "rollout_state_error": "state error after replay",
-    "gap": "gap of plan and replay",
-    "dynamics_residual": "dynamics residual",
-    "initial_state_error": "error of x(0)",
+    "gap": "gap of plan and replay, squared",
+    "dynamics_residual": "dynamics residual, squared",
+    "initial_state_error": "error of x(0), squared",
     "median_cost_ratio": "median cost / optimal cost",
     "robots_served": "share of robots served",
     "cost_ratio": "cost / optimal cost",
@@ -56,9 +56,15 @@ METRICS = {
     "network_calls": "network calls",
     "collision_rollout": "share in collision after replay",
     "collision_planned": "share in collision, as planned",
-    "waypoint_distance_1": "distance to waypoint 1",
-    "waypoint_distance_2": "distance to waypoint 2",
-    "side_agreement": "same side as the expert",
+    "waypoint_distance_1_planned": "distance to waypoint 1, as planned [m]",
+    "waypoint_distance_2_planned": "distance to waypoint 2, as planned [m]",
+    "waypoint_distance_1_rollout": "distance to waypoint 1 after replay [m]",
+    "waypoint_distance_2_rollout": "distance to waypoint 2 after replay [m]",
+    "waypoint_distance_target_rollout": "distance to the target after replay [m]",
+    "collision_at_samples_rollout": "share in collision at samples, after replay",
+    "depth_rollout": "depth of collision after replay [m]",
+    "clearance_rollout": "clearance after replay [m]",
+    "side_agreement_rollout": "same side as the expert, after replay",
 }
 SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
@@ -90,9 +96,12 @@ def method_name(axes: Mapping[str, Any], shown: Iterable[str] = ()) -> str:
 
 def axis_value(axis: str, value: Any) -> str:
     """One condition in words, for example `S = 100` or `every step`."""
-    if axis in CHOICES:
-        return WORDS.get(axis, {}).get(str(value), str(value))
-    return f"{axis_name(axis)} = {format(value, 'g') if isinstance(value, float) else value}"
+    return value_name(axis, value) if axis in CHOICES else f"{axis_name(axis)} = {value_name(axis, value)}"
+
+
+def value_name(axis: str, value: Any) -> str:
+    """What an axis is set to, in words."""
+    return WORDS.get(axis, {}).get(str(value), format(value, "g") if isinstance(value, float) else str(value))
 
 
 def number(value: float | None, digits: int = 3) -> str:
@@ -108,15 +117,14 @@ def number(value: float | None, digits: int = 3) -> str:
         return "∞" if value > 0 else "−∞"
     if value == round(value) and abs(value) < 1e4:
         return f"{value:.0f}".replace("-", "−")
+    mantissa, exponent = f"{value:.{digits - 1}e}".split("e")  # rounded before its decimals are counted
     if 1e-3 <= abs(value) < 1e4:
-        decimals = max(digits - 1 - math.floor(math.log10(abs(value))), 0)
-        return f"{value:.{decimals}f}".replace("-", "−")
-    mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
+        return f"{value:.{max(digits - 1 - int(exponent), 0)}f}".replace("-", "−")
     return f"{mantissa}·10{str(int(exponent)).translate(SUPERSCRIPT)}".replace("-", "−")
 
 
 def with_interval(value: float, low: float, high: float) -> str:
     """A value and its 95 % interval, if it has any width."""
-    if low == high:
+    if low == high or math.isnan(low):
         return number(value)
     return f"{number(value)} [{number(low)}, {number(high)}]"

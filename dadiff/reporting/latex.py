@@ -13,6 +13,7 @@ SPECIAL = {
     "†": r"$^\dagger$", "‖": r"$\|$", "²": r"$^2$", "·": r"$\cdot$", "×": r"$\times$", "σ": r"$\sigma$",
     "Γ": r"$\Gamma$", "−": "$-$", "–": "--", "∞": r"$\infty$", "°": r"$^\circ$",
 }  # fmt: skip
+CONTROL = re.compile(r"[\x00-\x1f\x7f]")
 NORMAL = {ord(raised): chr(plain) for plain, raised in ((k, chr(v)) for k, v in SUPERSCRIPT.items())}
 
 
@@ -23,7 +24,9 @@ def escape(text: str) -> str:
         >>> escape("a_b & 50 %")
         'a\\\\_b \\\\& 50 \\\\%'
     """
-    raised = re.sub(r"10([⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+)", lambda m: f"10\0{m[1].translate(NORMAL)}\1", " ".join(text.split()))
+    raised = re.sub(
+        r"10([⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+)", lambda m: f"10\0{m[1].translate(NORMAL)}\1", " ".join(CONTROL.sub(" ", text).split())
+    )
     escaped = "".join(SPECIAL.get(character, character) for character in raised)
     return escaped.replace("\0", "$^{").replace("\1", "}$")
 

@@ -14,6 +14,7 @@ import numpy as np
 from dadiff.reporting.aggregation import Evidence, Method, case_means, case_scalars, has_metric, pair, weights_for
 from dadiff.reporting.labels import axis_value, method_name, metric_name, with_interval
 from dadiff.reporting.selection import Selector
+from dadiff.reporting.sources import Cell
 from dadiff.reporting.statistics import (
     Band,
     Estimate,
@@ -23,6 +24,7 @@ from dadiff.reporting.statistics import (
     ratio,
     resampled_means,
     simultaneous_band,
+    widening,
 )
 
 
@@ -44,11 +46,11 @@ Measure = Callable[..., list[Measured]]
 def _usable(methods: list[Method], shown: list[str], out: list[Measured], metric: str = "") -> Iterator[Method]:
     """Methods with results; what became of the others goes to `out`."""
     for method in methods:
-        label = method_name(method.axes, shown)
         if method.diverged or not method.finished:
+            label = method_name(method.axes, shown)
             out.append(Measured(label, method.axes, None, method.outcome, method.keys, method.diverged))
         elif metric and not has_metric(method.finished, metric):
-            out.append(Measured(label, method.axes, None, f"has no {metric_name(metric)}", method.keys))
+            out.append(_without(method, shown, f"has no {metric_name(metric)}"))
         else:
             yield method
 
@@ -61,8 +63,7 @@ def _pairs(
         other = evidence.partner(method, against)
         if other is None or not has_metric(other.finished, metric):
             wanted = ", ".join(axis_value(axis, value) for axis, value in against.items())
-            text = f"no finished run of {wanted} to compare with"
-            out.append(Measured(method_name(method.axes, shown), method.axes, None, text, method.keys))
+            out.append(_without(method, shown, f"no finished run of {wanted} to compare with"))
         else:
             yield method, other
 
@@ -73,7 +74,7 @@ def level(evidence: Evidence, methods: list[Method], shown: list[str], *, metric
     for method in _usable(methods, shown, out, metric):
         values = case_scalars(method.finished, metric)
         estimate = mean(values, weights_for(values.shape))
-        text = f"{metric_name(metric)} {_words(estimate)}"
+        text = f"{metric_name(metric)} {_words(estimate)}{_lost(method)}"
         out.append(Measured(method_name(method.axes, shown), method.axes, estimate, text, method.keys))
     return out
 
@@ -87,8 +88,10 @@ def ratio_to(
         own, theirs = pair(method, other)
         values, baseline = case_scalars(own, metric), case_scalars(theirs, metric)
         estimate = ratio(values, baseline, weights_for(values.shape))
-        text = f"{metric_name(metric)} {_words(estimate)} times that of {_name_of(other, against)}"
-        out.append(Measured(method_name(method.axes, shown), method.axes, estimate, text, method.keys + other.keys))
+        text = (
+            f"{metric_name(metric)} {_words(estimate)} times that of {_name_of(other, against)}{_lost(method, other)}"
+        )
+        out.append(Measured(method_name(method.axes, shown), method.axes, estimate, text, _keys(own, theirs)))
     return out
 
 
@@ -104,10 +107,13 @@ def worst_difference(
         own, theirs = pair(method, other)
         values = case_means(own, metric) - case_means(theirs, metric)
         values = values[..., ~np.isnan(values).all(axis=tuple(range(values.ndim - 1)))]
+        if not values.size:
+            out.append(_without(method, shown, f"{metric_name(metric)} is defined nowhere"))
+            continue
         band = simultaneous_band(values, weights_for(values.shape[:-1]))
         estimate = Estimate(float(band.value.max()), float(band.low.max()), float(band.high.max()))
-        text = f"{metric_name(metric)} {_along(band)}, against {_name_of(other, against)}"
-        out.append(Measured(method_name(method.axes, shown), method.axes, estimate, text, method.keys + other.keys))
+        text = f"{metric_name(metric)} {_along(band)}, against {_name_of(other, against)}{_lost(method, other)}"
+        out.append(Measured(method_name(method.axes, shown), method.axes, estimate, text, _keys(own, theirs)))
     return out
 
 
@@ -130,7 +136,7 @@ def dip(
         for t in (t for t in times if t + apart < values.shape[-1]):
             around = (values[..., t - apart] + values[..., t + apart]) / 2
             estimate = ratio(values[..., t], around, weights)
-            text = f"error {_words(estimate)} times that {apart} steps before and after"
+            text = f"error {_words(estimate)} times that {apart} steps before and after{_lost(method)}"
             label = f"{method_name(method.axes, shown)}, t = {t}"
             out.append(Measured(label, {**method.axes, "t": t}, estimate, text, method.keys))
     return out
@@ -148,7 +154,7 @@ def longest_over_shortest(
         short, long = (case_scalars(m.finished, metric) for m in (group[0], group[-1]))
         estimate = _unpaired_ratio(long, short)
         ends = " and ".join(axis_value(axis, m.axes[axis]) for m in (group[-1], group[0]))
-        text = f"ratio of {metric_name(metric)} at {ends}: {_words(estimate)}"
+        text = f"ratio of {metric_name(metric)} at {ends}: {_words(estimate)}{_lost(group[0], group[-1])}"
         axes = {name: value for name, value in group[0].axes.items() if name != axis}
         out.append(Measured(method_name(axes, rest), axes, estimate, text, [k for m in group for k in m.keys]))
     return out
@@ -164,9 +170,10 @@ def _groups(methods: list[Method], axis: str) -> list[list[Method]]:
 
 def _unpaired_ratio(values: np.ndarray, baseline: np.ndarray) -> Estimate:
     """Of means, where numbers of replicates may differ; the cases are the same."""
-    above, below = (resampled_means(x, weights_for(x.shape)) for x in (values, baseline))
-    point = plain_mean(values, weights_for(values.shape)) / plain_mean(baseline, weights_for(baseline.shape))
-    return Estimate(float(point), *interval(above / below))
+    drawn = [weights_for(x.shape) for x in (values, baseline)]
+    above, below = (resampled_means(x, weights) for x, weights in zip((values, baseline), drawn, strict=True))
+    point = float(plain_mean(values, drawn[0]) / plain_mean(baseline, drawn[1]))
+    return Estimate(point, *interval(above / below, point, max(drawn, key=widening), log=True))
 
 
 def share_grew(evidence: Evidence, methods: list[Method], shown: list[str], *, stage: str) -> list[Measured]:
@@ -179,6 +186,9 @@ def share_grew(evidence: Evidence, methods: list[Method], shown: list[str], *, s
             continue
         rows = [cell.table("chain") for cell in followed]
         grew = np.concatenate([table.loc[table["stage"] == stage, "grew"].dropna() for table in rows])
+        if not grew.size:
+            out.append(Measured(label, method.axes, None, "its chain has no half-step of this kind", []))
+            continue
         estimate = Estimate(*(float(grew.max()),) * 3)
         steps = f"{int((grew > 0).sum())} of {len(grew)} half-steps"
         text = f"the distance grew for up to {100 * grew.max():.3g} % of the plans, in {steps}"
@@ -187,14 +197,15 @@ def share_grew(evidence: Evidence, methods: list[Method], shown: list[str], *, s
 
 
 def projection_share(evidence: Evidence, methods: list[Method], shown: list[str]) -> list[Measured]:
-    """The time of all projections over the time of sampling."""
+    """The time of all projections over the time of sampling; of a single run, as it was timed."""
     out: list[Measured] = []
     for method in _usable(methods, shown, out, "projection_seconds"):
         parts = ("projection_seconds", "projection_calls", "sampling_seconds")
         seconds, calls, total = (case_scalars(method.finished, name) for name in parts)
         values = seconds * calls / total
-        estimate = mean(values, weights_for(values.shape))
-        text = f"{100 * estimate.value:.3g} % of the sampling time"
+        estimate = mean(values, weights_for(values.shape)) if values.size > 1 else Estimate(*[values.item()] * 3)
+        percent = Estimate(*(100 * x for x in (estimate.value, estimate.low, estimate.high)))
+        text = f"{_words(percent)} % of the sampling time{' of one run' * (values.size == 1)}{_lost(method)}"
         out.append(Measured(method_name(method.axes, shown), method.axes, estimate, text, method.keys))
     return out
 
@@ -211,6 +222,21 @@ def schedule_conditions(evidence: Evidence, methods: list[Method], shown: list[s
                 count = Estimate(*(float(sum(conditions.values())),) * 3)
                 found[name] = Measured(name, {"schedule": name}, count, text, [cell.key])
     return list(found.values())
+
+
+def _without(method: Method, shown: list[str], why: str) -> Measured:
+    return Measured(method_name(method.axes, shown), method.axes, None, why, method.keys)
+
+
+def _keys(*parts: list[Cell]) -> list[str]:
+    """Of the runs that were compared, each once."""
+    return list(dict.fromkeys(cell.key for part in parts for cell in part))
+
+
+def _lost(*methods: Method) -> str:
+    """A warning that a number rests on a part of the replicates."""
+    parts = [f"{len(m.finished)} of {len(m.cells)} replicates: {m.outcome}" for m in methods if m.lost]
+    return f" ({'; '.join(dict.fromkeys(parts))})" if parts else ""
 
 
 def _name_of(other: Method, against: Selector) -> str:

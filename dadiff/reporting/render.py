@@ -30,6 +30,7 @@ from dadiff.reporting.tables import to_csv
 from dadiff.store.files import make_folder, strict
 
 FORMAT = 1
+FORMS = (".csv", ".tex", ".pdf", ".svg", ".png")
 PUBLISHED = ("report.json", "configurations.yaml", "tables/*.csv", "figures/*.svg")
 WIDE, NARROW = 2, 1
 """Columns of panels on a page or screen, and on a phone."""
@@ -42,7 +43,7 @@ def render(report: Report, folder: Path) -> Path:
         StoreError: if the folder cannot be written to.
     """
     for part in ("tables", "figures"):
-        make_folder(folder / part)
+        _cleared(folder / part)
     drawings = {part.item.id: _draw(part) for part in report.figures if not part.empty}
     try:
         _write_tables(report, folder / "tables")
@@ -63,11 +64,20 @@ def publish(report: Path, folder: Path) -> None:
     Raises:
         StoreError: if the folder cannot be written to.
     """
+    for part in ("tables", "figures"):
+        _cleared(folder / part)
     for part in PUBLISHED:
         for path in sorted(report.glob(part)):
             target = folder / path.relative_to(report)
             make_folder(target.parent)
             shutil.copyfile(path, target)
+
+
+def _cleared(folder: Path) -> None:
+    """Make the folder, or empty it of what an older report left."""
+    for path in make_folder(folder).iterdir():
+        if path.suffix in FORMS:
+            path.unlink()
 
 
 @dataclass(frozen=True)

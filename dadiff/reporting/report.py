@@ -10,6 +10,9 @@ from dadiff.reporting.claims import Claim, Verdict, judge
 from dadiff.reporting.definitions import Definition, Item
 from dadiff.reporting.sources import Cell
 
+WITHOUT_INTERVALS = ("paths", "diffusion", "chain")
+"""Kinds of figures that show single plans or runs."""
+
 
 @dataclass(frozen=True)
 class Part:
@@ -39,9 +42,18 @@ class Report:
     tables: list[Part]
 
     @property
-    def lost(self) -> list[Cell]:
-        """Cells without results."""
-        return [cell for cell in self.evidence.sweep.cells if cell.status != "finished"]
+    def again(self) -> str:
+        """What a person types to make everything again."""
+        return " && ".join(filter(None, (self.evidence.sweep.command, self.command)))
+
+    @property
+    def lost(self) -> dict[str, list[Cell]]:
+        """Cells without results, by what became of them."""
+        groups: dict[str, list[Cell]] = {}
+        for cell in self.evidence.sweep.cells:
+            if cell.status != "finished":
+                groups.setdefault(cell.outcome, []).append(cell)
+        return groups
 
 
 def build(definition: Definition, evidence: Evidence, ledger: list[Claim], command: str) -> Report:
@@ -64,38 +76,42 @@ def build(definition: Definition, evidence: Evidence, ledger: list[Claim], comma
 def _part(item: Item, evidence: Evidence) -> Part:
     content = item.collect(evidence, **item.options)
     runs = list(dict.fromkeys(content.runs))
-    return Part(item, content, facts(evidence, runs), content.notes, runs)
+    told = facts(evidence, runs, intervals=item.kind not in WITHOUT_INTERVALS)
+    return Part(item, content, told, content.notes, runs)
 
 
-def facts(evidence: Evidence, runs: list[str]) -> str:
-    """The numbers of seeds, robots, cases and plans behind a part, and what its intervals cover."""
-    cells = [cell for cell in evidence.sweep.cells if cell.key in set(runs) and cell.status == "finished"]
-    if not cells:
+def facts(evidence: Evidence, runs: list[str], *, intervals: bool = True) -> str:
+    """The numbers of seeds, recordings, robots, cases and plans behind a part, and what its intervals cover.
+
+    Args:
+        intervals: whether the part shows any.
+    """
+    methods = [method for method in evidence.all_methods if set(method.keys) & set(runs)]
+    counts = [method.counts() for method in methods]
+    told = [_several(unit, {count.get(name, 0) for count in counts}) for name, unit in COUNTED.items()]
+    text = f"{', '.join(filter(None, told))}."
+    if not methods:
         return ""
-    counts = [_several(name, {cell.record["counts"].get(key) for cell in cells}) for name, key in COUNTED.items()]
-    seeds = {cell.axes.get("seed") for cell in cells}
-    trained = any(cell.record["links"].get("denoiser") for cell in cells)
-    recordings = {cell.record["links"].get("recording") for cell in cells} - {None}
-    counts.append(f"{len(seeds)} {'training ' * trained}seed{'s' * (len(seeds) > 1)}")
-    counts += [f"{len(recordings)} recording{'s' * (len(recordings) > 1)}"] if recordings else []
-    units = ["robots"] if "robots" in cells[0].record["counts"] else []
-    units = (["recordings"] if len(recordings) > len(seeds) else []) + units + ["cases"]
-    covered = _covered(len(seeds), trained, " and ".join([", ".join(units[:-1]), units[-1]] if units[1:] else units))
-    return f"{', '.join(filter(None, counts))}. {covered}"
+    return f"{text} {_covered(counts)}" if intervals else text
 
 
-COUNTED = {"robot": "robots", "case": "cases", "plan a case": "samples"}
+COUNTED = {"training seeds": "training seed", "seeds": "seed", "recordings": "recording", "robots": "robot",
+           "cases": "case", "samples": "plan a case"}  # fmt: skip
 
 
-def _several(name: str, values: set[int | None]) -> str:
+def _several(name: str, values: set[int]) -> str:
     known = sorted(value for value in values if value)
-    unit = name if known == [1] else name.replace(" ", "s ", 1) if " " in name else f"{name}s"
+    unit = name if known == [1] else name.replace(" a ", "s a ") if " a " in name else f"{name}s"
     return f"{' or '.join(map(str, known))} {unit}" if known else ""
 
 
-def _covered(seeds: int, trained: bool, units: str) -> str:
-    if seeds == 1:
-        what = "training seed" if trained else "seed"
-        return f"95 % intervals, with one {what}: they cover {units} only."
-    few = "; with so few seeds they are rough" if seeds < 5 else ""
-    return f"95 % intervals by a bootstrap over seeds, and {units} within them{few}."
+def _covered(counts: list[dict[str, int]]) -> str:
+    most = {name: max(count.get(name, 0) for count in counts) for name in COUNTED}
+    seeds = max(most["training seeds"], most["seeds"])
+    many = most["recordings"] > seeds  # else they change with the seed
+    units = ["recordings"] * many + ["robots"] * (most["robots"] > 0) + ["cases"]
+    covered = " and ".join([", ".join(units[:-1]), units[-1]] if units[1:] else units)
+    if seeds < 2:
+        kind = "training seed" if most["training seeds"] else "seed"
+        return f"95 % intervals, with one {kind}: they cover {covered} only."
+    return f"95 % intervals by a bootstrap over seeds, {covered}, widened for {seeds} seeds by Student's t."

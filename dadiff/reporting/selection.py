@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from dadiff.errors import ConfigError
+from dadiff.reporting.labels import axis_name, value_name
 
 Selector = Mapping[str, Any]
 
@@ -30,6 +31,25 @@ def matches(axes: Mapping[str, Any], selector: Selector) -> bool:
         ConfigError: if a comparison is not one of above, below, not.
     """
     return all(_meets(axes.get(axis), condition) for axis, condition in selector.items())
+
+
+def described(selector: Selector) -> str:
+    """A selector in words.
+
+    Example:
+        >>> described({"projector": {"not": "none"}, "enforcement": ["literal"], "recording.length": {"above": 93}})
+        'projector other than vanilla, enforcement as printed, S above 93'
+    """
+    return ", ".join(f"{axis_name(axis)} {_condition(axis, condition)}" for axis, condition in selector.items())
+
+
+def _condition(axis: str, condition: Any) -> str:
+    if isinstance(condition, Mapping):
+        words = {"not": "other than"}
+        return " and ".join(f"{words.get(name, name)} {_condition(axis, bound)}" for name, bound in condition.items())
+    if isinstance(condition, list):
+        return " or ".join(_condition(axis, value) for value in condition)
+    return "none" if condition is None else value_name(axis, condition)
 
 
 def _meets(value: Any, condition: Any) -> bool:

@@ -28,8 +28,15 @@ def _table(folder: Path, name: str) -> pd.DataFrame:
     return StoredRun(folder, {"status": "finished"}).table(name)
 
 
+def without_password(uri: str) -> str:
+    """A uri as it may be shown."""
+    scheme, there, rest = uri.partition("://")
+    host, slash, path = rest.partition("/")
+    return f"{scheme}{there}{host.rpartition('@')[2]}{slash}{path}"
+
+
 def _server(uri: str) -> str:
-    return uri.rstrip("/") if uri.startswith(("http://", "https://")) else LOCAL_UI
+    return without_password(uri).rstrip("/") if uri.startswith(("http://", "https://")) else LOCAL_UI
 
 
 @dataclass(frozen=True)
@@ -132,7 +139,7 @@ def read_sweeps(output_dir: Path, names: list[str]) -> Sweep:
         StoreError: if a sweep is not there, or a file is damaged or too new.
     """
     sweeps = [_read(output_dir, name) for name in names]
-    commands = dict.fromkeys(sweep.command for sweep in sweeps)
+    commands = dict.fromkeys(sweep.command for sweep in sweeps if sweep.command)
     return Sweep("+".join(names), " && ".join(commands), [cell for sweep in sweeps for cell in sweep.cells])
 
 

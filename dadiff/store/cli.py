@@ -11,6 +11,7 @@ from pathlib import Path
 from dadiff.errors import DadiffError, StoreError
 from dadiff.store.cache import Cache, Entry, damage
 from dadiff.store.results import Results
+from dadiff.store.sweeps import Sweeps
 
 
 def users(output_dir: Path) -> Counter[tuple[str, str]]:
@@ -50,18 +51,29 @@ def prune(output_dir: Path, *, dry_run: bool) -> list[str]:
     """Remove what no stored run was made with, what is damaged and what was left half built.
 
     Raises:
-        StoreError: while runs are being worked on, since they may need what no stored run needs yet.
+        StoreError: while something is being worked on, which may need what no stored run needs yet.
     """
-    if working := Results(output_dir).working_keys():
-        raise StoreError(f"{output_dir}: {len(working)} runs are being worked on; prune when they have ended")
+    _check_quiet(output_dir)
     counts, lines = users(output_dir), []
     for entry in Cache(output_dir).entries():
-        if entry.state == "building" or (entry.state == "whole" and counts[entry.kind, entry.key]):
+        if entry.state == "whole" and counts[entry.kind, entry.key]:
             continue
         lines.append(f"{'would remove' if dry_run else 'removed'} {_line(entry, 0)}")
         if not dry_run:
             shutil.rmtree(entry.folder)
     return lines
+
+
+def _check_quiet(output_dir: Path) -> None:
+    sweeps = Sweeps(output_dir)
+    if running := [name for name in sweeps.names() if sweeps.is_running(name)]:
+        raise StoreError(f"{output_dir}: sweep {running[0]} is being run; prune when it has ended")
+    if working := Results(output_dir).working_keys():
+        raise StoreError(f"{output_dir}: {len(working)} runs are being worked on; prune when they have ended")
+    if building := [entry for entry in Cache(output_dir).entries() if entry.state == "building"]:
+        raise StoreError(
+            f"{output_dir}: {building[0].kind} {building[0].key} is being built; prune when that has ended"
+        )
 
 
 def _line(entry: Entry, count: int) -> str:

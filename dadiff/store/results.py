@@ -7,6 +7,7 @@ A failed run is recorded too, with its reason; such a record gives way when the 
 
 from __future__ import annotations
 
+import logging
 import math
 import shutil
 from collections.abc import Iterator, Mapping
@@ -15,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dadiff.errors import StoreError
+from dadiff.errors import LockedError, StoreError
 from dadiff.store.files import is_locked, locked, make_folder, read_json, sync_folder, write_json
 
 if TYPE_CHECKING:
@@ -26,6 +27,9 @@ DONE = ("finished", "diverged", "infeasible", "refused")
 """Statuses that are results (`refused`: the recording does not determine the dynamics); any other is done again."""
 
 RECORD = "run.json"
+PATIENCE_SECONDS = 2.0  # for a process that is just ending
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -179,9 +183,14 @@ class Results:
         return self.read(key)
 
     def write_failure(self, record: Mapping[str, Any], status: str, reason: str) -> None:
-        """Record how a run failed, unless a result with its key is already there."""
-        if not self.is_done(record["key"]):
-            self.write({**record, "status": status, "reason": reason})
+        """Record how a run failed, unless a result with its key is there already, or on its way."""
+        key = record["key"]
+        try:
+            with locked(self._lock_file(key), f"run {key}", PATIENCE_SECONDS):
+                if not self.is_done(key):
+                    self.write({**record, "status": status, "reason": reason})
+        except LockedError:
+            log.info("run %s: failed here (%s), but another process works on it", key, reason)
 
     def _lock_file(self, key: str) -> Path:
         return self.root / ".locks" / f"{key}.lock"

@@ -141,7 +141,11 @@ def spared(what: str) -> Iterator[None]:
     try:
         yield
     except failures() as error:
-        log.warning("MLflow did not take %s (%s); it is on disk, dadiff-sync uploads it", what, first_line(error))
+        log.warning(
+            "MLflow did not take %s (%s); it is on disk, dadiff-sync or the same command uploads it",
+            what,
+            first_line(error),
+        )
 
 
 def first_line(error: BaseException) -> str:

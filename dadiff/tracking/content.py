@@ -126,7 +126,7 @@ def sweep_content(sweep: Sweep, table_file: Path) -> Content:
         "`results.csv` among the artifacts has one row a cell.",
         *(["Not finished:\n" + "\n".join(failed)] if failed else []),
     ]
-    tags = {"mlflow.note.content": "\n\n".join(note), "kind": "sweep"}
+    tags = {"mlflow.note.content": "\n\n".join(note), "kind": "sweep", "command": sweep.command}
     metrics = [(name, value, 0) for name, value in counts.items()]
     return Content({name: _text(value) for name, value in sweep.definition.items()}, metrics, tags, [table_file])
 

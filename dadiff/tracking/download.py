@@ -30,24 +30,25 @@ def download(uri: str, name: str, folder: Path) -> Sweep:
         raise StoreError(f"MLflow: {json.dumps(name)} holds a quote; give the name of a sweep or of an experiment")
     with refused(uri):
         client = open_client(uri)
-        runs, definition = _find(client, name)
+        runs, definition, command = _find(client, name)
         cells = [_fetch(client, run, folder) for run in runs]
     if not cells:
         raise StoreError(f"MLflow at {uri}: no sweep and no experiment {name!r} with runs; see the names in its UI")
-    sweep = Sweep(name, f"dadiff +sweeps={name}", definition, cells)
+    sweep = Sweep(name, command, definition, cells)
     Sweeps(folder).write(sweep)
     return sweep
 
 
-def _find(client: MlflowClient, name: str) -> tuple[list[Run], dict[str, str]]:
-    """The runs, oldest first, and what the sweep ranges over."""
+def _find(client: MlflowClient, name: str) -> tuple[list[Run], dict[str, str], str]:
+    """The runs, oldest first, what the sweep ranges over, and the command that runs it; an experiment has none."""
     experiments = [experiment.experiment_id for experiment in client.search_experiments()]
     parents = client.search_runs(experiments, f"tags.kind = 'sweep' and tags.key = '{name}'")
     if parents:
         children = f"tags.mlflow.parentRunId = '{parents[0].info.run_id}' and tags.kind = 'run'"
-        return _all(client, experiments, children), dict(parents[0].data.params)
+        parent = parents[0].data
+        return _all(client, experiments, children), dict(parent.params), parent.tags.get("command", "")
     experiment = client.get_experiment_by_name(name)
-    return _all(client, [experiment.experiment_id], "tags.kind = 'run'") if experiment else [], {}
+    return _all(client, [experiment.experiment_id], "tags.kind = 'run'") if experiment else [], {}, ""
 
 
 def _all(client: MlflowClient, experiments: list[str], condition: str) -> list[Run]:

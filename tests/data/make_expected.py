@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 import tempfile
 from pathlib import Path
@@ -11,7 +12,7 @@ from dadiff.reporting import cli
 HERE = Path(__file__).parent
 
 if __name__ == "__main__":
-    with tempfile.TemporaryDirectory() as folder:
-        cli.main(["lqr_made_up", "--output-dir", str(HERE / "store"), "--out", folder])
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(HERE):
+        cli.main(["lqr_made_up", "--output-dir", "store", "--out", folder])
         (HERE / "expected").mkdir(exist_ok=True)
         shutil.copy(Path(folder) / "report.json", HERE / "expected" / "lqr_made_up.json")

@@ -17,6 +17,9 @@ from dadiff.reporting.labels import axis_name, axis_value, method_name, metric_n
 from dadiff.reporting.selection import Selector
 from dadiff.reporting.statistics import Estimate, mean, ratio
 
+MARKS = ((0, (1, 1.5)), (0, (4, 1.5, 1, 1.5)), (0, (7, 2)))
+"""Dashes of marked places."""
+
 
 @dataclass(frozen=True)
 class Line:
@@ -63,10 +66,8 @@ class Against:
         return figure
 
     def _mark(self, ax: Axes) -> None:
-        for text, x in self.marked.items():
-            ax.axvline(x, color="#888888", lw=0.8, ls=":", zorder=0)
-            ax.annotate(text, (x, 0), xycoords=("data", "axes fraction"), xytext=(2, 3), textcoords="offset points",
-                        va="bottom", fontsize=7, rotation=90, color="#888888")  # fmt: skip
+        for (text, x), dots in zip(self.marked.items(), MARKS, strict=False):
+            ax.axvline(x, color="#888888", lw=1, ls=dots, zorder=0, label=f"{text} ({axis_name(self.axis)} = {x:g})")
         if self.relative:
             ax.axhline(1, color="#888888", lw=0.8, zorder=0)
 
@@ -110,15 +111,14 @@ def collect(
     used = [m for m in wanted if m.finished and (not relative_to or evidence.partner(m, relative_to))]
     flat = [m for m in evidence.methods(levels) if m.finished] if levels else []
     values = list(dict.fromkeys(m.axes.get(by) for m in used)) if by else [None]
-    ignored = {axis, by, *varying(flat)}
-    shown = [name for name in varying(used) if name not in ignored]
+    shown, levelled = ([name for name in varying(methods) if name not in (axis, by)] for methods in (used, flat))
 
     def panel(metric: str, value: Any) -> Panel:
         here = [m for m in used if has_metric(m.finished, metric) and (by is None or m.axes.get(by) == value)]
         beside = [m for m in flat if has_metric(m.finished, metric) and (by is None or m.axes.get(by) in (value, None))]
         groups = [group for group in _lines(here, axis) if len(group) > 1]
         lines = [_line(evidence, group, axis, metric, shown, relative_to) for group in groups]
-        return Panel(axis_value(by, value) if by else "", metric, lines, [_level(m, metric) for m in beside])
+        return Panel(axis_value(by, value) if by else "", metric, lines, [_level(m, metric, levelled) for m in beside])
 
     every = [p for p in (panel(metric, value) for metric in metrics for value in values) if p.lines]
     runs = [key for m in (*used, *flat) for key in m.keys] if every else []
@@ -152,6 +152,6 @@ def _estimate(evidence: Evidence, method: Method, metric: str, baseline: Selecto
     return ratio(values, case_scalars(theirs, metric), weights_for(values.shape))
 
 
-def _level(method: Method, metric: str) -> Line:
+def _level(method: Method, metric: str, shown: list[str]) -> Line:
     values = case_scalars(method.finished, metric)
-    return Line(method_name(method.axes), method.axes, [], [mean(values, weights_for(values.shape))])
+    return Line(method_name(method.axes, shown), method.axes, [], [mean(values, weights_for(values.shape))])

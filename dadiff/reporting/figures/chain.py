@@ -15,7 +15,7 @@ from dadiff.reporting.selection import Selector
 from dadiff.reporting.sources import Cell
 
 PANELS = {
-    "on_support": "distance on the support",
+    "on_support": "squared distance on the support",
     "off_support": "squared distance off it",
     "grew_predict": "share that grew, prediction",
     "grew_project": "share that grew, projection",
@@ -46,7 +46,9 @@ class Chain:
         for ax, (name, title) in zip(axes, PANELS.items(), strict=True):
             for trace, look in zip(self.traces, looks_of([trace.axes for trace in self.traces]), strict=True):
                 ax.plot(trace.steps, trace.values[name], color=look.colour, ls=look.line, lw=1.2, label=trace.label)
-            ax.invert_xaxis()
+            ax.set_xscale("symlog", linthresh=10)  # most happens in the last steps
+            ax.set_xticks([0, 5, 10, 100, 1000], ["0", "5", "10", "100", "1000"])
+            ax.set_xlim(max(trace.steps.max() for trace in self.traces), -0.5)
             ax.set_xlabel("diffusion step i")
             ax.set_title(title)
             if name.endswith("support"):

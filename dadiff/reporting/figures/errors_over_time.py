@@ -66,7 +66,7 @@ def _draw_panel(ax: Axes, panel: Panel, marked: list[int]) -> None:
         ax.axvline(t_marked, color="#888888", lw=0.8, ls=":", zorder=0)
     log_axis(ax, "y")
     ax.set_title("\n".join(filter(None, (metric_name(panel.metric), panel.condition))))
-    ax.set_xlabel("time t")
+    ax.set_xlabel("time t [steps]")
 
 
 def collect(

@@ -146,9 +146,10 @@ def log_axis(ax: Axes, which: Literal["x", "y"]) -> None:
     axis.set_major_formatter(FuncFormatter(lambda value, _: decade(value)))
     axis.set_minor_formatter(NullFormatter())
     if high / low < 25:
-        axis.set_minor_locator(LogLocator(subs=(2, 5)))
+        fine = high / low < 3
+        axis.set_minor_locator(LogLocator(subs=(1.2, 1.4, 1.6, 1.8, 2, 2.5, 3, 4, 5, 6, 8) if fine else (2, 5)))
         axis.set_minor_formatter(
-            FuncFormatter(lambda value, _: f"{value:g}" if 1e-3 < value < 1e4 else number(value, 1))
+            FuncFormatter(lambda value, _: f"{value:g}" if 1e-3 < value < 1e4 else number(value, 2 if fine else 1))
         )
 
 
