@@ -1,5 +1,6 @@
 """Every command and every example of the README runs."""
 
+import json
 import os
 import re
 import subprocess
@@ -8,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-README = (Path(__file__).parent.parent / "README.md").read_text()
+ROOT = Path(__file__).parent.parent
+README = (ROOT / "README.md").read_text()
 SMALL = ["dataset.train_size=40", "dataset.test_size=2", "evaluation.samples=1", "schedule.num_steps=30"]
 SMALL += ["training.steps=3", "training.warmup=0", "sampler.skip_below=0", "progress=false"]
 
@@ -55,3 +57,32 @@ def test_the_projector_of_the_readme_is_one_class_and_one_yaml(tmp_path):
     refused = dadiff([*chosen, *SMALL], tmp_path)
     assert refused.returncode == 1
     assert "components=[mylab]" in refused.stderr
+
+
+def published(name: str) -> dict:
+    return json.loads((ROOT / "reports" / "published" / name / "report.json").read_text())
+
+
+def test_the_table_of_verdicts_is_that_of_the_published_reports():
+    rows = re.findall(r"^\| (.*?) \| (.*?) \| \[`?(\w+)`?\]\(reports/published/(\w+)\) \|$", README, flags=re.MULTILINE)
+    assert len(rows) > 15
+    for claim, verdict, shown, name in rows:
+        assert shown == name
+        found = {entry["claim"]["claim"]: entry["verdict"] for entry in published(name)["claims"]}
+        assert found[claim] == verdict
+
+
+def test_what_is_published_is_whole_small_and_knows_no_place():
+    folder = ROOT / "reports" / "published"
+    files = [path for path in folder.rglob("*") if path.is_file()]
+    assert sum(path.stat().st_size for path in files) < 8e6
+    for name in (path.name for path in folder.iterdir()):
+        assert {"report.json", "configurations.yaml", "figures", "tables"} <= {p.name for p in (folder / name).iterdir()}
+        assert f"`{name}`" in README
+    for path in files:
+        assert not re.search(r"(?<![\w.])/(tmp|home|root|work)/", path.read_text())
+
+
+def test_pictures_of_the_readme_are_there():
+    for picture in re.findall(r"!\[.*?\]\((.*?)\)", README):
+        assert (ROOT / picture).is_file()

@@ -239,7 +239,10 @@ def test_the_condition_does_not_hide_a_true_finding_without_the_axis():
     said = [("vanilla", {"projector": "none"}, True), ("fixed", {"projector": "known", "initial_state": "fixed"}, True),
             ("free", {"projector": "known", "initial_state": "free"}, False)]  # fmt: skip
     found = [Finding(label, axes, estimate, true, "", []) for label, axes, true in said]
-    assert condition(found) == "vanilla; fixed"
+    assert condition(found) == "without initial state or x(0) fixed"
+    assert (
+        condition([*found, Finding("other", {"initial_state": "fixed"}, estimate, False, "", [])]) == "vanilla; fixed"
+    )
 
 
 def test_selectors_are_told_in_words(tmp_path):

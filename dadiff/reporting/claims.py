@@ -23,10 +23,13 @@ import yaml
 
 from dadiff.errors import ConfigError
 from dadiff.reporting.aggregation import Evidence, Method, varying
-from dadiff.reporting.labels import axis_value
+from dadiff.reporting.labels import axis_name, axis_value
 from dadiff.reporting.measures import MEASURES, Measured
 from dadiff.reporting.selection import described
 from dadiff.reporting.statistics import Estimate
+
+NAMED = 3
+"""Methods that a verdict names, if no axis sets them apart."""
 
 BOUNDS = ("above", "below", "at_least", "at_most")
 
@@ -164,14 +167,19 @@ def _verdict(findings: list[Finding]) -> str:
 
 
 def condition(findings: list[Finding]) -> str:
-    """The axis that tells true findings from false ones, if one does; else the true ones by name."""
-    true, false = ([f.axes for f in findings if f.true is wanted] for wanted in (True, False))
-    for axis in dict.fromkeys(name for axes in (*true, *false) for name in axes):
-        inside, outside = ({repr(axes.get(axis)) for axes in group} for group in (true, false))
-        values = list(dict.fromkeys(axes[axis] for axes in true if not isinstance(axes.get(axis), (list, type(None)))))
-        if len(values) == len(inside) and not inside & outside:
-            return " or ".join(axis_value(axis, value) for value in values)
-    return "; ".join(finding.label for finding in findings if finding.true)
+    """The axis that tells true findings from false ones, if one does; else the true ones by name, or their number."""
+    true, false = ([f for f in findings if f.true is wanted] for wanted in (True, False))
+    for axis in dict.fromkeys(name for finding in findings for name in finding.axes):
+        inside, outside = ({repr(f.axes.get(axis)): f.axes.get(axis) for f in group} for group in (true, false))
+        if not inside.keys() & outside.keys() and not any(isinstance(value, list) for value in inside.values()):
+            return " or ".join(_value(axis, value) for value in inside.values())
+    if len(true) > NAMED:
+        return f"the method is one of {len(true)} (of {len(findings)}) that are named below"
+    return "; ".join(finding.label for finding in true)
+
+
+def _value(axis: str, value: Any) -> str:
+    return f"without {axis_name(axis)}" if value is None else axis_value(axis, value)
 
 
 def _lines(claim: Claim, findings: list[Finding], unavailable: dict[str, str]) -> list[str]:

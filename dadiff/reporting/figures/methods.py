@@ -71,8 +71,8 @@ def _draw_rows(ax: Axes, rows: list[Row], *, log: bool) -> None:
         offsets = y + 0.32 * (np.arange(len(row.dots)) / max(1, len(row.dots) - 1) - 0.5)
         ax.plot(row.dots, offsets, ".", color=look.colour, alpha=0.6, ms=5.5, mew=0)
         bars = [[row.estimate.value - row.estimate.low], [row.estimate.high - row.estimate.value]]
-        ax.errorbar(row.estimate.value, y, xerr=bars, fmt="none", color=look.colour, capsize=3)
-        ax.plot(row.estimate.value, y, ls="", ms=6, **look.points)
+        ax.plot(row.estimate.value, y, ls="", ms=5, **look.points)
+        ax.errorbar(row.estimate.value, y, xerr=bars, fmt="none", color=look.colour, capsize=4, lw=1.6)
     ax.set_yticks(range(len(rows)), [row.label for row in rows])
     ax.set_ylim(len(rows) - 0.4, -0.6)
     if log and any(row.estimate for row in rows):

@@ -41,6 +41,7 @@ VARIANTS = (((0, (2, 1.5)), "left"), ((0, (6, 1.5)), "bottom"), ((0, (3, 1, 1, 1
 OTHER = ("#5b5bd6", "X")
 PANEL_WIDTH, PANEL_HEIGHT = 3.7, 2.75
 CHARACTER = 0.072  # inches that a character of a legend takes, about
+LEGEND_LINE = 0.17  # inches of height that a line of a legend takes
 RC: dict[Any, Any] = {
     "svg.hashsalt": "dadiff",
     "svg.fonttype": "none",
@@ -134,8 +135,10 @@ def legend_below(figure: Figure, axes: list[Axes]) -> None:
     entries = {label: handle for ax in axes for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
     if entries:
         widest = CHARACTER * max(map(len, entries)) + 0.55
-        fit = max(1, int(figure.get_figwidth() / widest))
-        figure.legend(entries.values(), entries.keys(), loc="outside lower center", ncols=min(fit, len(entries)))
+        columns = min(max(1, int(figure.get_figwidth() / widest)), len(entries))
+        rows = -(-len(entries) // columns)
+        figure.set_figheight(figure.get_figheight() + LEGEND_LINE * max(0, rows - 3))  # few fit into what is there
+        figure.legend(entries.values(), entries.keys(), loc="outside lower center", ncols=columns)
 
 
 def log_axis(ax: Axes, which: Literal["x", "y"]) -> None:
