@@ -77,7 +77,9 @@ def test_what_is_published_is_whole_small_and_knows_no_place():
     files = [path for path in folder.rglob("*") if path.is_file()]
     assert sum(path.stat().st_size for path in files) < 8e6
     for name in (path.name for path in folder.iterdir()):
-        assert {"report.json", "configurations.yaml", "figures", "tables"} <= {p.name for p in (folder / name).iterdir()}
+        assert {"report.json", "configurations.yaml", "figures", "tables"} <= {
+            p.name for p in (folder / name).iterdir()
+        }
         assert f"`{name}`" in README
     for path in files:
         assert not re.search(r"(?<![\w.])/(tmp|home|root|work)/", path.read_text())

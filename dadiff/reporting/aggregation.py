@@ -180,15 +180,17 @@ def case_scalars(cells: list[Cell], metric: str, group: str | None = None) -> np
 def _table_with(cell: Cell, metric: str) -> str | None:
     """The table of a run that holds a metric per plan or per step."""
     for name in ("per_step", "per_plan"):
-        if cell.has(name) and metric in cell.table(name).columns:
+        if cell.has_column(name, metric):
             return name
     return None
 
 
 def _of_cell(cell: Cell, metric: str, group: str | None) -> np.ndarray:
     if name := _table_with(cell, metric):
-        values = dense(cell.table(name), metric, where=f"run {cell.key}, {name}")
-        means = values.mean(axis=-2 if name == "per_step" else -1)
+        if (name, metric) not in cell.means:
+            values = dense(cell.table(name), metric, where=f"run {cell.key}, {name}")
+            cell.means[name, metric] = values.mean(axis=-2 if name == "per_step" else -1)
+        means = cell.means[name, metric]
         return means if group is None else means[_robots_in(cell, group)]
     if metric not in cell.metrics:
         raise StoreError(f"run {cell.key} ({cell.name}): has no metric {metric!r}; found {', '.join(cell.metrics)}")
@@ -213,12 +215,16 @@ def dense(table: pd.DataFrame, column: str, *, where: str) -> np.ndarray:
         StoreError: if a combination of indices is missing or comes twice.
     """
     index = [name for name in LEVELS if name in table.columns]
-    shape = tuple(table[name].nunique() for name in index)
-    if len(table) != np.prod(shape) or table.duplicated(index).any():
+    codes = [pd.factorize(table[name], sort=True) for name in index]
+    shape = tuple(len(found) for _, found in codes)
+    place = np.ravel_multi_index([code for code, _ in codes], shape)
+    if len(table) != np.prod(shape) or (np.bincount(place) != 1).any():
         raise StoreError(
             f"{where}: has {len(table)} rows for {dict(zip(index, shape, strict=True))}; expected each once"
         )
-    return table.sort_values(index)[column].to_numpy(dtype=np.float64).reshape(shape)
+    values = np.empty(len(table))
+    values[place] = table[column]
+    return values.reshape(shape)
 
 
 def varying(methods: list[Method]) -> list[str]:

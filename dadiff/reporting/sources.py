@@ -28,6 +28,11 @@ def _table(folder: Path, name: str) -> pd.DataFrame:
     return StoredRun(folder, {"status": "finished"}).table(name)
 
 
+@lru_cache(maxsize=4096)
+def _columns(folder: Path, name: str) -> tuple[str, ...]:
+    return tuple(_table(folder, name).columns)
+
+
 def without_password(uri: str) -> str:
     """A uri as it may be shown."""
     scheme, there, rest = uri.partition("://")
@@ -49,6 +54,7 @@ class Cell:
         axes: flat parameters; those that are null do not apply.
         run: None if nothing was stored.
         waiting: what the sweep's record says of a cell without a run.
+        means: over the plans of each case, of the tables and metrics that were asked for.
     """
 
     key: str
@@ -56,6 +62,7 @@ class Cell:
     axes: dict[str, Any]
     run: StoredRun | None = field(repr=False)
     waiting: str | None = None
+    means: dict[tuple[str, str], np.ndarray] = field(default_factory=dict, repr=False, compare=False)
 
     @property
     def record(self) -> dict[str, Any]:
@@ -92,6 +99,10 @@ class Cell:
     def has(self, table: str) -> bool:
         """Whether the run holds this table."""
         return self.run is not None and self.run.has(table)
+
+    def has_column(self, table: str, column: str) -> bool:
+        """Whether the run holds this table, and that this column."""
+        return self.run is not None and self.run.has(table) and column in _columns(self.run.folder, table)
 
     def table(self, name: str) -> pd.DataFrame:
         """The stored table `per_step`, `per_plan` or `chain`.
