@@ -245,6 +245,13 @@ def test_the_condition_does_not_hide_a_true_finding_without_the_axis():
     )
 
 
+def test_the_condition_promises_nothing_of_open_findings():
+    said = [("a", "known", True), ("b", "hankel", None), ("c", "rollout", False)]
+    found = [Finding(label, {"projector": p}, Estimate(1, 1, 1), true, "", []) for label, p, true in said]
+    assert condition(found) == "known FF†"
+    assert condition([*found, Finding("d", {"projector": "known"}, Estimate(1, 1, 1), None, "", [])]) == "a"
+
+
 def test_selectors_are_told_in_words(tmp_path):
     store = MadeUp(tmp_path)
     store.run(1.0)

@@ -167,10 +167,10 @@ def _verdict(findings: list[Finding]) -> str:
 
 
 def condition(findings: list[Finding]) -> str:
-    """The axis that tells true findings from false ones, if one does; else the true ones by name, or their number."""
-    true, false = ([f for f in findings if f.true is wanted] for wanted in (True, False))
+    """The axis that tells true findings from all others, if one does; else the true ones by name, or their number."""
+    true, others = ([f for f in findings if bool(f.true) is wanted] for wanted in (True, False))
     for axis in dict.fromkeys(name for finding in findings for name in finding.axes):
-        inside, outside = ({repr(f.axes.get(axis)): f.axes.get(axis) for f in group} for group in (true, false))
+        inside, outside = ({repr(f.axes.get(axis)): f.axes.get(axis) for f in group} for group in (true, others))
         if not inside.keys() & outside.keys() and not any(isinstance(value, list) for value in inside.values()):
             return " or ".join(_value(axis, value) for value in inside.values())
     if len(true) > NAMED:

@@ -30,6 +30,9 @@ from dadiff.reporting.tables import to_csv
 from dadiff.store.files import make_folder, strict
 
 FORMAT = 1
+DIGITS = 6
+"""Of numbers in report.json: the last ones differ between processors."""
+
 FORMS = (".csv", ".tex", ".pdf", ".svg", ".png")
 PUBLISHED = ("report.json", "configurations.yaml", "tables/*.csv", "figures/*.svg")
 WIDE, NARROW = 2, 1
@@ -50,7 +53,7 @@ def render(report: Report, folder: Path) -> Path:
         for name, drawing in drawings.items():
             for form, content in drawing.files.items():
                 (folder / "figures" / f"{name}.{form}").write_bytes(content)
-        (folder / "report.json").write_text(json.dumps(numbers(report), indent=1, allow_nan=False) + "\n", "utf-8")
+        (folder / "report.json").write_text(to_json(numbers(report)), "utf-8")
         (folder / "configurations.yaml").write_text(configurations.to_yaml(report.evidence.sweep), "utf-8")
         (folder / "index.html").write_text(to_html(report, drawings), "utf-8")
     except OSError as error:
@@ -123,6 +126,20 @@ def numbers(report: Report) -> dict[str, Any]:
         "figures": {part.item.id: _part(part) for part in report.figures},
     }
     return strict(content)
+
+
+def to_json(content: dict[str, Any]) -> str:
+    """Indented, with a list of numbers on one line, to `DIGITS` significant digits."""
+    text = json.dumps(_rounded(content), indent=1, allow_nan=False)
+    return re.sub(r"\[[-+\d.eE,\s]*\]", lambda found: re.sub(r"\s+", "", found[0]), text) + "\n"
+
+
+def _rounded(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _rounded(part) for name, part in value.items()}
+    if isinstance(value, list):
+        return [_rounded(part) for part in value]
+    return float(f"{value:.{DIGITS}g}") if isinstance(value, float) else value
 
 
 def _part(part: Part) -> dict[str, Any]:

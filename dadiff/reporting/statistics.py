@@ -107,7 +107,7 @@ def interval(resampled: np.ndarray, point: float, weights: np.ndarray, *, log: b
     if not resampled.size or weights[0].size == 1:
         return float("nan"), float("nan")
     low, high = np.quantile(resampled, [tail, 1 - tail])
-    by = widening(weights)
+    low, high, by = min(low, point), max(high, point), widening(weights)
     if log and low > 0:
         return float(point * (low / point) ** by), float(point * (high / point) ** by)
     return float(point - by * (point - low)), float(point + by * (high - point))

@@ -16,7 +16,7 @@ from typing import Any, Literal, Protocol
 import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
 
 from dadiff.reporting.labels import SUPERSCRIPT, number
 
@@ -148,7 +148,11 @@ def log_axis(ax: Axes, which: Literal["x", "y"]) -> None:
     low, high = sorted(axis.get_view_interval())
     axis.set_major_formatter(FuncFormatter(lambda value, _: decade(value)))
     axis.set_minor_formatter(NullFormatter())
-    if high / low < 25:
+    if high / low < 1.5:
+        axis.set_major_locator(MaxNLocator(4))
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}" if value > 1e-3 else number(value, 3)))
+        axis.set_minor_locator(NullLocator())
+    elif high / low < 25:
         fine = high / low < 3
         axis.set_minor_locator(LogLocator(subs=(1.2, 1.4, 1.6, 1.8, 2, 2.5, 3, 4, 5, 6, 8) if fine else (2, 5)))
         axis.set_minor_formatter(
