@@ -22,6 +22,7 @@ from dadiff.reporting import cli, configurations, labels, latex
 from dadiff.reporting.aggregation import Evidence, case_means, case_scalars, pair, varying
 from dadiff.reporting.definitions import Item, for_sweep, load, names
 from dadiff.reporting.figures.style import COLOURS, MARKERS, RC, looks_of, render
+from dadiff.reporting.render import to_json
 from dadiff.reporting.report import build
 from dadiff.reporting.selection import matches
 from dadiff.reporting.sources import read_sweeps, without_password
@@ -378,3 +379,12 @@ def test_reports_need_no_torch(tmp_path):
     arguments = ["hankel_length_made_up", "--output-dir", str(STORE), "--out", str(tmp_path)]
     done = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=True)
     assert done.stdout.split()[-2:] == ["0", "False"]
+
+
+def test_the_json_keeps_its_words_and_has_a_list_of_numbers_on_a_line():
+    content = {"lines": ["between [0.1, 0.2]"], "values": [1.23456789, 2, None], "none": []}
+    text = to_json(content)
+    assert '"between [0.1, 0.2]"' in text
+    assert json.loads(text) == {**content, "values": [1.23457, 2, None]}
+    assert '"values": [1.23457,2' not in to_json({"values": [1.0, "x"]})
+    assert '"values": [1.0,2.0]' in to_json({"values": [1.0, 2.0]})

@@ -131,7 +131,7 @@ def numbers(report: Report) -> dict[str, Any]:
 def to_json(content: dict[str, Any]) -> str:
     """Indented, with a list of numbers on one line, to `DIGITS` significant digits."""
     text = json.dumps(_rounded(content), indent=1, allow_nan=False)
-    return re.sub(r"\[[-+\d.eE,\s]*\]", lambda found: re.sub(r"\s+", "", found[0]), text) + "\n"
+    return re.sub(r"\[\n[-+\d.eE,\s]*\]", lambda found: re.sub(r"\s+", "", found[0]), text) + "\n"
 
 
 def _rounded(value: Any) -> Any:
