@@ -90,6 +90,9 @@ def test_what_is_published_is_numbers_configurations_and_drawings(tmp_path):
     for folder in (out / "figures", published / "figures"):
         folder.mkdir(parents=True)
         (folder / "older.svg").write_text("of another definition")
+        (folder / "mine.svg").write_text("a reader's own")
+        older = {"tables": {}, "figures": {"older": {"runs": ["0123456789abcdef"]}}}
+        (folder.parent / "report.json").write_text(json.dumps(older))
     command = ["lqr_made_up", "--output-dir", str(STORE), "--out", str(out), "--publish", str(published)]
     assert cli.main(command) == 0
     files = {path.relative_to(published).as_posix() for path in published.rglob("*") if path.is_file()}
@@ -97,6 +100,8 @@ def test_what_is_published_is_numbers_configurations_and_drawings(tmp_path):
     assert {Path(file).suffix for file in files} == {".json", ".yaml", ".csv", ".svg"}
     assert not (out / "figures" / "older.svg").exists()
     assert not (published / "figures" / "older.svg").exists()
+    assert (out / "figures" / "mine.svg").exists()
+    assert (published / "figures" / "mine.svg").exists()
     stored = yaml.safe_load((published / "configurations.yaml").read_text())
     cells = evidence("lqr_made_up").sweep.cells
     assert stored["cells"].keys() == {cell.key for cell in cells if cell.record}
@@ -140,7 +145,7 @@ def test_every_part_says_how_to_make_it_again_and_from_how_much(report):
     assert facts.startswith(
         "3 training seeds, 3 recordings, 6 cases, 3 plans a case. 95 % intervals by a bootstrap over"
     )
-    assert facts.endswith("seeds, cases, widened for 3 seeds by Student's t.")
+    assert facts.endswith("seeds and cases, widened for 3 seeds by Student's t.")
     assert "interval" not in content["figures"]["theorem1"]["facts"]
     page = (report / "index.html").read_text()
     shown = [part for part in (*content["tables"].values(), *content["figures"].values()) if part["runs"]]

@@ -13,14 +13,13 @@ radius; a slot whose three numbers are all nan is empty. Waypoints and obstacles
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from dadiff.datasets.files import UNREADABLE
+from dadiff.datasets.files import opened
 from dadiff.errors import DataError
 from dadiff.tasks.environments import Environments, check, encode, join
 from dadiff.tasks.obstacles import Obstacles
@@ -66,13 +65,8 @@ def _from_yaml(path: Path) -> list[Any]:
 
 
 def _from_npz(path: Path) -> list[Any]:
-    if not zipfile.is_zipfile(path):
-        raise DataError(f"{path}: is not a readable .npz file; write it with numpy.savez")
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-    except UNREADABLE as error:
-        raise DataError(f"{path}: not readable as npz: {' '.join(str(error).split())}") from error
+    with opened(path, "an array") as file:
+        arrays = {name: file[name] for name in file.files}
     for name in _REQUIRED:
         if name not in arrays:
             raise DataError(f"{path}: '{name}' is missing; expected arrays {', '.join(_REQUIRED + _OPTIONAL)}")

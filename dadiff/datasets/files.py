@@ -9,7 +9,8 @@ import hashlib
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -75,16 +76,30 @@ def read_array(file: Path, names: Sequence[str], shape: tuple[int | None, ...]) 
 
 
 def _first_of(file: Path, names: Sequence[str], label: str) -> np.ndarray:
+    with opened(file, f"array {label}") as archive:
+        present = [name for name in names if name in archive.files]
+        if not present:
+            raise DataError(f"{file}: has no array {label}; found {', '.join(archive.files) or 'none'}")
+        return np.asarray(archive[present[0]])
+
+
+@contextmanager
+def opened(file: Path, what: str) -> Iterator[np.lib.npyio.NpzFile]:
+    """An .npz file open for reading; nothing in it is executed.
+
+    Args:
+        what: is read from it, for the message.
+
+    Raises:
+        DataError: if it is no such file, or what is read from it is damaged.
+    """
     if not zipfile.is_zipfile(file):
         raise DataError(f"{file}: is not a readable .npz file; write it with numpy.savez")
     try:
         with np.load(file, allow_pickle=False) as archive:
-            present = [name for name in names if name in archive.files]
-            if not present:
-                raise DataError(f"{file}: has no array {label}; found {', '.join(archive.files) or 'none'}")
-            return np.asarray(archive[present[0]])
+            yield archive
     except UNREADABLE as error:
-        raise DataError(f"{file}: array {label} cannot be read ({error})") from error
+        raise DataError(f"{file}: {what} cannot be read ({' '.join(str(error).split())})") from error
 
 
 @dataclass(frozen=True)

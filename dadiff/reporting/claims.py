@@ -174,7 +174,7 @@ def condition(findings: list[Finding]) -> str:
         if not inside.keys() & outside.keys() and not any(isinstance(value, list) for value in inside.values()):
             return " or ".join(_value(axis, value) for value in inside.values())
     if len(true) > NAMED:
-        return f"the method is one of {len(true)} (of {len(findings)}) that are named below"
+        return f"the method is one of {len(true)} of {len(findings)} (named in the claim's details)"
     return "; ".join(finding.label for finding in true)
 
 

@@ -33,20 +33,21 @@ FORMAT = 1
 DIGITS = 6
 """Of numbers in report.json: the last ones differ between processors."""
 
-FORMS = (".csv", ".tex", ".pdf", ".svg", ".png")
+FORMS = {"tables": ("csv", "tex"), "figures": ("pdf", "svg", "png")}
 PUBLISHED = ("report.json", "configurations.yaml", "tables/*.csv", "figures/*.svg")
 WIDE, NARROW = 2, 1
 """Columns of panels on a page or screen, and on a phone."""
 
 
 def render(report: Report, folder: Path) -> Path:
-    """Write all files of a report; the path of its index.html.
+    """Write all files of a report; the path of its index.html. What an older report left there goes, nothing else.
 
     Raises:
         StoreError: if the folder cannot be written to.
     """
-    for part in ("tables", "figures"):
-        _cleared(folder / part)
+    for part in FORMS:
+        make_folder(folder / part)
+    older = _parts_in(folder)
     drawings = {part.item.id: _draw(part) for part in report.figures if not part.empty}
     try:
         _write_tables(report, folder / "tables")
@@ -56,6 +57,7 @@ def render(report: Report, folder: Path) -> Path:
         (folder / "report.json").write_text(to_json(numbers(report)), "utf-8")
         (folder / "configurations.yaml").write_text(configurations.to_yaml(report.evidence.sweep), "utf-8")
         (folder / "index.html").write_text(to_html(report, drawings), "utf-8")
+        _remove(folder, older - _parts_in(folder))
     except OSError as error:
         raise StoreError(f"{folder}: cannot be written ({error.strerror}); choose another --out") from None
     return folder / "index.html"
@@ -67,20 +69,28 @@ def publish(report: Path, folder: Path) -> None:
     Raises:
         StoreError: if the folder cannot be written to.
     """
-    for part in ("tables", "figures"):
-        _cleared(folder / part)
+    older = _parts_in(folder)
     for part in PUBLISHED:
         for path in sorted(report.glob(part)):
             target = folder / path.relative_to(report)
             make_folder(target.parent)
             shutil.copyfile(path, target)
+    _remove(folder, older - _parts_in(folder))
 
 
-def _cleared(folder: Path) -> None:
-    """Make the folder, or empty it of what an older report left."""
-    for path in make_folder(folder).iterdir():
-        if path.suffix in FORMS:
-            path.unlink()
+def _parts_in(folder: Path) -> set[str]:
+    """The files of tables and figures that the report in a folder names; none if there is no report."""
+    try:
+        content = json.loads((folder / "report.json").read_text("utf-8"))
+        shown = [(part, Path(name).name) for part in FORMS for name, shown in content[part].items() if shown["runs"]]
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return set()
+    return {f"{part}/{name}.{form}" for part, name in shown for form in FORMS[part]}
+
+
+def _remove(folder: Path, parts: set[str]) -> None:
+    for part in parts:
+        (folder / part).unlink(missing_ok=True)
 
 
 @dataclass(frozen=True)
@@ -92,7 +102,7 @@ class Drawing:
 
 
 def _draw(part: Part) -> Drawing:
-    files = render_figure(part.content, WIDE, ("pdf", "svg", "png"))
+    files = render_figure(part.content, WIDE, FORMS["figures"])
     title, name = part.item.title, part.item.id
     wide = Markup(inline_svg(files["svg"], title, name))
     phone = render_figure(part.content, NARROW, ("svg",))["svg"]

@@ -110,8 +110,11 @@ def _covered(counts: list[dict[str, int]]) -> str:
     seeds = max(most["training seeds"], most["seeds"])
     many = most["recordings"] > seeds  # else they change with the seed
     units = ["recordings"] * many + ["robots"] * (most["robots"] > 0) + ["cases"]
-    covered = " and ".join([", ".join(units[:-1]), units[-1]] if units[1:] else units)
     if seeds < 2:
         kind = "training seed" if most["training seeds"] else "seed"
-        return f"95 % intervals, with one {kind}: they cover {covered} only."
-    return f"95 % intervals by a bootstrap over seeds, {covered}, widened for {seeds} seeds by Student's t."
+        return f"95 % intervals, with one {kind}: they cover {_listed(units)} only."
+    return f"95 % intervals by a bootstrap over {_listed(['seeds', *units])}, widened for {seeds} seeds by Student's t."
+
+
+def _listed(words: list[str]) -> str:
+    return " and ".join(filter(None, (", ".join(words[:-1]), words[-1])))
