@@ -102,13 +102,13 @@ def test_every_way_to_end_has_its_status_and_reason(launcher, tmp_path):
         work(tmp_path, "then", time.sleep, 0.1, needs=["fine"]),
     ]
     observer = Silent()
-    outcomes = make_pool(launcher, tmp_path, time_limit=3.0).run(works, observer)
+    outcomes = make_pool(launcher, tmp_path, time_limit=10.0).run(works, observer)
     assert {key: outcome.status for key, outcome in outcomes.items()} == {
         "bug": "failed", "crash": "killed", "late": "timeout", "fine": "finished", "after": "failed", "then": "finished"
     }  # fmt: skip
     assert f"ValueError: math domain error; log: {tmp_path}/logs/bug.log" in outcomes["bug"].reason
     assert "Traceback" in (tmp_path / "logs" / "bug.log").read_text()
-    assert "time limit of 3 s" in outcomes["late"].reason
+    assert "time limit of 10 s" in outcomes["late"].reason
     assert "needs bug, which failed: ValueError" in outcomes["after"].reason
     assert 1 <= observer.most <= 2
 
