@@ -15,12 +15,13 @@ import matplotlib
 import numpy as np
 import pytest
 import yaml
-from made_up import MadeUp
+from made_up import MadeUp, example_arrays
 
 from dadiff.errors import ConfigError, StoreError
 from dadiff.reporting import cli, configurations, labels, latex
 from dadiff.reporting.aggregation import Evidence, case_means, case_scalars, pair, varying
 from dadiff.reporting.definitions import Item, for_sweep, load, names
+from dadiff.reporting.figures import paths
 from dadiff.reporting.figures.style import COLOURS, MARKERS, RC, looks_of, render
 from dadiff.reporting.render import to_json
 from dadiff.reporting.report import build
@@ -199,6 +200,25 @@ def test_figures_through_their_data(name):
         assert wanted <= legend | ticks | {title.removeprefix(title[: title.find(") ") + 2]) for title in titles} | {
             label for label in wanted if any(label in title for title in titles)
         }, part.item.id
+
+
+def test_paths_have_a_panel_a_condition_and_share_a_line_where_they_coincide(tmp_path):
+    store = MadeUp(tmp_path, "obstacles_made_up", horizon=40)
+    for last_step_noise, projector, level in (
+        (True, "none", 1.0), (True, "known", 0.2), (True, "hankel", 0.2),
+        (False, "none", 0.9), (False, "known", 0.1), (False, "hankel", 0.12),
+    ):  # fmt: skip
+        store.run(level, task="obstacles", projector=projector, sampler__last_step_noise=last_step_noise,
+                  enforcement=None if projector == "none" else "normalised", denoiser="mlp",
+                  arrays=example_arrays(40, level))  # fmt: skip
+    store.sweep()
+    seen = Evidence(read_sweeps(tmp_path, [store.name]))
+    drawn = paths.collect(seen, cells={}, sample_of_data=True, by="sampler.last_step_noise")
+    assert {panel.title: [path.label for path in panel.paths] for panel in drawn.panels} == {
+        "a sample of the data": [],
+        "plans, with last-step noise": ["vanilla", "known FF† = Hankel HH†"],
+        "plans, without last-step noise": ["vanilla", "known FF†", "Hankel HH†"],
+    }
 
 
 def _labelled(content) -> list:

@@ -6,7 +6,7 @@ Fig. 3 (a, b) of the paper; on the fleet a row a robot. The first two states are
 from __future__ import annotations
 
 import textwrap
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ from matplotlib.patches import Circle
 
 from dadiff.reporting.aggregation import Evidence, Method, varying
 from dadiff.reporting.figures.style import INK, legend_below, letter, look_of, panels
-from dadiff.reporting.labels import method_name
+from dadiff.reporting.labels import axis_value, method_name
 from dadiff.reporting.selection import Selector
 from dadiff.tasks.environments import decode
 
@@ -69,7 +69,7 @@ class Paths:
         for ax, panel in zip(axes, self.panels, strict=True):
             _draw_panel(ax, panel)
             _window(ax, [p for p in self.panels if p.optimum is panel.optimum])
-        if self.across <= 2:
+        if self.across <= 3:
             letter(axes)
         if any(path.replayed is not None for panel in self.panels for path in panel.paths):
             axes[0].plot([], [], color=INK, lw=1.5, label="plan")
@@ -121,6 +121,7 @@ def collect(
     case: int | None = None,
     robots: list[int] | None = None,
     sample_of_data: bool = False,
+    by: str | None = None,
     apart: bool = False,
 ) -> Paths:
     """Plans of one case from the same noise: the first seed, the first plan.
@@ -129,11 +130,13 @@ def collect(
         case: among the stored examples; None takes the one whose optimum passes a disc most closely, or the first.
         robots: of a fleet, a row each.
         sample_of_data: a first panel with the optimum alone.
+        by: an axis with a panel of its own for each value.
         apart: a panel a method, with the replay of its inputs, instead of one panel for all.
     """
     methods = evidence.methods(cells)
     used = [m for m in methods if m.finished and "states" in m.finished[0].examples]
-    shown, drawn = varying(methods), []
+    values = list(dict.fromkeys(m.axes.get(by) for m in used)) if by else [None]
+    shown, drawn = [name for name in varying(methods) if name != by], []
     rows: list[int] | list[None] = robots or [None]
     for robot in rows if used else []:
         case = _most_telling(used[0], robot) if case is None else case
@@ -147,9 +150,12 @@ def collect(
                 Panel(f"{title}: {p.label}" if robot is not None else p.label, scene, optimum, [p]) for p in paths
             ]
         else:
-            drawn.append(Panel(title, scene, optimum, paths))
-    across = min(len(used), 6 if robots else 4) if apart else 2
-    notes = [f"{method_name(m.axes, shown)}: {m.outcome}" for m in methods if m.lost]
+            for value in values:
+                here = [path for path in paths if by is None or path.axes.get(by) == value]
+                condition = f", {axis_value(by, value)}" if by and len(values) > 1 else ""
+                drawn.append(Panel(title + condition, scene, optimum, _told_apart(here)))
+    across = min(len(used), 6 if robots else 4) if apart else min(max(len(values) + sample_of_data, 2), 3)
+    notes = [f"{method_name(m.axes, varying(methods))}: {m.outcome}" for m in methods if m.lost]
     return Paths(drawn, across, [m.finished[0].key for m in used], notes)
 
 
@@ -175,6 +181,20 @@ def _of(method: Method, name: str, robot: int | None, case: int) -> np.ndarray:
 def _path(method: Method, robot: int | None, case: int, shown: list[str], *, replay: bool) -> Path:
     planned, replayed = (_of(method, name, robot, case)[0, :, :2] for name in ("states", "rollout_states"))
     return Path(method_name(method.axes, shown), method.axes, planned, replayed if replay else None)
+
+
+def _told_apart(paths: list[Path]) -> list[Path]:
+    """Plans that no eye can tell apart as one, named after all of them."""
+    distinct: list[Path] = []
+    for path in paths:
+        extent = np.ptp(path.planned, axis=0).max()
+        for index, other in enumerate(distinct):
+            if np.abs(path.planned - other.planned).max() < 1e-3 * extent:
+                distinct[index] = replace(other, label=f"{other.label} = {path.label}")
+                break
+        else:
+            distinct.append(path)
+    return distinct
 
 
 def _scene(method: Method, robot: int | None, case: int) -> tuple[Scene, np.ndarray]:
