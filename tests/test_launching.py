@@ -5,6 +5,8 @@ from __future__ import annotations
 import io
 import os
 import signal
+import subprocess
+import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -136,6 +138,25 @@ def test_threads_are_limited_and_work_after_the_fork(tmp_path):
     outcomes = ProcessPool(workers=1).run([work(tmp_path, "a", multiply, tmp_path / "a")], Silent())
     assert outcomes["a"].reason is None
     assert (tmp_path / "a").read_text() == "64000000 1 1"
+
+
+def test_a_module_in_the_current_folder_is_not_imported_for_one_of_its_name(tmp_path):
+    (tmp_path / "textwrap.py").write_text("raise SystemExit('imported from the current folder')")
+    script = tmp_path / "bin" / "go.py"
+    script.parent.mkdir()
+    script.write_text(
+        "from pathlib import Path\n"
+        "from dadiff.launching.process_pool import ProcessPool\n"
+        "from test_launching import Silent, work, write\n"
+        "works = [work(Path.cwd(), 'a', write, Path('out'), 'done')]\n"
+        "if __name__ == '__main__':\n"
+        "    ProcessPool(workers=1, preload=['textwrap']).run(works, Silent())\n"
+    )
+    path = os.pathsep.join([str(Path(__file__).parents[1]), str(Path(__file__).parent)])
+    subprocess.run(
+        [sys.executable, script], cwd=tmp_path, env={**os.environ, "PYTHONPATH": path}, check=True, timeout=60
+    )
+    assert (tmp_path / "out").read_text() == "done\n"
 
 
 def test_an_interrupt_ends_the_jobs(pool, tmp_path):

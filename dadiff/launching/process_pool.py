@@ -20,7 +20,10 @@ from dadiff.launching.outcome import Outcome
 from dadiff.launching.pool import GRACE_SECONDS, TICK_SECONDS, Pool, check_positive
 from dadiff.launching.work import Observer, Running, Work, environment, perform, thread_limits
 
-QUIET = {"PYTHONWARNINGS": "ignore:resource_tracker"}  # which warns of the locks of every job that was ended
+SERVER = {
+    "PYTHONWARNINGS": "ignore:resource_tracker",  # which warns of the locks of every job that was ended
+    "PYTHONSAFEPATH": "1",  # what it imports is what the launcher imports, whatever lies in the current folder
+}
 
 
 @dataclass
@@ -97,7 +100,7 @@ def _start_server(threads: int) -> None:
     """Start the server that jobs are forked from; it inherits the limits on threads of its environment."""
     from multiprocessing import forkserver
 
-    with environment({**thread_limits(threads), **QUIET}):
+    with environment({**thread_limits(threads), **SERVER}):
         forkserver.ensure_running()
 
 
