@@ -28,31 +28,36 @@ class Projection:
     Orthogonal if analysis = synthesis; `rollout` is the oblique case.
 
     Args:
-        analysis, synthesis: (*robots, d, r).
+        analysis: (*robots, d, r), or the slice of z that it selects.
+        synthesis: (*robots, d, r).
         offset: (*robots, 1, d) for all plans of a robot, or (*robots, plans, d) with one a plan.
     """
 
-    analysis: Array = field(repr=False)
+    analysis: Array | slice = field(repr=False)
     synthesis: Array = field(repr=False)
     offset: Array = field(repr=False)
 
     def __call__(self, z: Array) -> Array:
         """Project z (*robots, ..., d); numpy with numpy, torch with torch. All plans of a robot go in one product."""
-        *robots, d, _ = self.analysis.shape
+        *robots, d, _ = self.synthesis.shape
         if (*z.shape[: len(robots)], z.shape[-1]) != (*robots, d):
             raise ShapeError(
                 f"projection: made for trajectories of shape {(*robots, '...', d)} (robots first), found "
                 f"{tuple(z.shape)}; build the projector from these robots' systems or recordings"
             )
         flat = z.reshape(*robots, -1, d)
-        image = (flat @ self.analysis) @ self.synthesis.swapaxes(-1, -2) + self.offset
+        g = flat[..., self.analysis] if isinstance(self.analysis, slice) else flat @ self.analysis
+        image = g @ self.synthesis.swapaxes(-1, -2) + self.offset
         return image.reshape(z.shape)
 
     def map(self, convert: Callable[[np.ndarray], Array]) -> Projection:
         """The same projection with converted arrays, for example torch tensors on a device."""
-        same = self.synthesis is self.analysis
-        analysis = convert(self.analysis)
-        return Projection(analysis, analysis if same else convert(self.synthesis), convert(self.offset))
+        analysis, synthesis = self.analysis, convert(self.synthesis)
+        if analysis is self.synthesis:
+            analysis = synthesis
+        elif not isinstance(analysis, slice):
+            analysis = convert(analysis)
+        return Projection(analysis, synthesis, convert(self.offset))
 
 
 @dataclass(frozen=True)
@@ -121,15 +126,11 @@ class Rollout:
 
     def projection(self, coordinates: Coordinates | None = None, x_init: np.ndarray | None = None) -> Projection:
         """As `AdmissibleSet.projection`."""
-        where = coordinates or physical(self.layout)
-        n = self.layout.state_dim
-        select = np.zeros((self.layout.size, self.layout.rank - n))
-        select[self.layout.all_inputs] = np.eye(self.layout.rank - n)
-        forced = self.F[..., n:]
-        mean = (forced @ (select.T @ where.mean))[..., None, :]
-        analysis = np.tile(where.scale[:, None] * select, (*self.F.shape[:-2], 1, 1))
-        origin = _starting_at(x_init, self.F[..., :n])
-        return Projection(analysis, forced / where.scale[:, None], where.to_scaled(origin + mean))
+        where, inputs = coordinates or physical(self.layout), self.layout.all_inputs
+        free, forced = np.split(self.F, [self.layout.state_dim], axis=-1)
+        synthesis = forced * where.scale[inputs] / where.scale[:, None]
+        mean = (forced @ where.mean[inputs])[..., None, :]
+        return Projection(inputs, synthesis, where.to_scaled(_starting_at(x_init, free) + mean))
 
 
 def _starting_at(x_init: np.ndarray | None, lift: np.ndarray) -> np.ndarray:
