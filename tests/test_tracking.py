@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import multiprocessing
 import os
@@ -157,12 +158,28 @@ def test_a_sweep_is_one_parent_however_often_it_is_run(tracking, tmp_path):
     (parent,) = runs(tracking, "tags.kind = 'sweep'")
     assert parent.info.status == "FAILED"
     assert "other: failed, why" in parent.data.tags["mlflow.note.content"]
-    assert parent.data.metrics == {"cells_failed": 1.0, "cells_finished": 1.0}
+    assert parent.data.tags["cells"] == "1 failed, 1 finished"
     (mirror,) = runs(tracking, f"tags.`mlflow.parentRunId` = '{parents[0]}'")
     assert mirror.info.run_name == run.name
     table = pd.read_csv(Sweeps(tmp_path).folder("quick") / "results.csv")
     assert list(table["gap"][:1]) == [1.5]
     assert list(table["status"]) == ["finished", "failed"]
+
+
+def test_a_sweep_that_was_extended_shows_what_it_is_now(tracking, tmp_path):
+    """MLflow refuses to change a parameter, and keeps the larger of two metrics of one step."""
+    first = [Cell("a" * 16, "a", {"seed": 0}, "failed", "why")]
+    both = [Cell("a" * 16, "a", {"seed": 0}, "finished"), Cell("b" * 16, "b", {"seed": 1}, "finished")]
+    for cells, seeds in ((first, "0"), (both, "0,1")):
+        sweep = Sweep("quick", "dadiff +sweeps=quick", {"seed": seeds}, cells)
+        Sweeps(tmp_path).write(sweep)
+        tracking.close_sweep(tracking.open_sweep(sweep, tmp_path), sweep, tmp_path, "finished")
+    (parent,) = runs(tracking, "tags.kind = 'sweep'")
+    assert json.loads(parent.data.tags["definition"]) == {"seed": "0,1"}
+    assert parent.data.tags["cells"] == "2 finished"
+    assert "| seed | 0,1 |" in parent.data.tags["mlflow.note.content"]
+    assert parent.info.status == "FINISHED"
+    assert is_tracked(Sweeps(tmp_path).folder("quick"), tracking.uri)
 
 
 def test_a_training_is_a_run_of_its_own(tracking, tmp_path):

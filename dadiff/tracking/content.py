@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -116,19 +117,27 @@ def training_content(manifest: dict[str, Any], folder: Path) -> Content:
 
 
 def sweep_content(sweep: Sweep, table_file: Path) -> Content:
-    """A sweep: what it ranges over as parameters, how many cells ended how, its table of results."""
-    statuses = [cell.status for cell in sweep.cells]
-    counts = {f"cells_{status}": float(statuses.count(status)) for status in sorted(set(statuses))}
+    """A sweep: what it ranges over, how many cells ended how, its table of results.
+
+    All in tags, which may change: parameters and metrics of MLflow keep what the first of several starts said.
+    """
+    counts = Counter(cell.status for cell in sweep.cells)
     failed = [f"- {cell.name}: {cell.status}, {cell.reason}" for cell in sweep.cells if cell.reason]
     note = [
         f"**{sweep.name}**: {len(sweep.cells)} cells. Run or resume it with",
         f"```\n{sweep.command}\n```",
+        *(["\n".join(["| over | values |", "|---|---|", *_rows(sweep.definition)])] if sweep.definition else []),
         "`results.csv` among the artifacts has one row a cell.",
         *(["Not finished:\n" + "\n".join(failed)] if failed else []),
     ]
-    tags = {"mlflow.note.content": "\n\n".join(note), "kind": "sweep", "command": sweep.command}
-    metrics = [(name, value, 0) for name, value in counts.items()]
-    return Content({name: _text(value) for name, value in sweep.definition.items()}, metrics, tags, [table_file])
+    tags = {
+        "mlflow.note.content": "\n\n".join(note),
+        "kind": "sweep",
+        "command": sweep.command,
+        "definition": json.dumps({name: _text(value) for name, value in sweep.definition.items()}),
+        "cells": ", ".join(f"{count} {status}" for status, count in sorted(counts.items())),
+    }
+    return Content(tags=tags, files=[table_file])
 
 
 def sweep_view(sweep: Sweep, parent: str) -> str:

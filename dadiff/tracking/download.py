@@ -45,8 +45,8 @@ def _find(client: MlflowClient, name: str) -> tuple[list[Run], dict[str, str], s
     parents = client.search_runs(experiments, f"tags.kind = 'sweep' and tags.key = '{name}'")
     if parents:
         children = f"tags.mlflow.parentRunId = '{parents[0].info.run_id}' and tags.kind = 'run'"
-        parent = parents[0].data
-        return _all(client, experiments, children), dict(parent.params), parent.tags.get("command", "")
+        tags = parents[0].data.tags
+        return _all(client, experiments, children), json.loads(tags.get("definition", "{}")), tags.get("command", "")
     experiment = client.get_experiment_by_name(name)
     return _all(client, [experiment.experiment_id], "tags.kind = 'run'") if experiment else [], {}, ""
 
