@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from dadiff.reporting.aggregation import Evidence
+from dadiff.reporting.aggregation import Evidence, Method
 from dadiff.reporting.claims import Claim, Verdict, judge
 from dadiff.reporting.definitions import Definition, Item
 from dadiff.reporting.sources import Cell
@@ -86,7 +86,8 @@ def facts(evidence: Evidence, runs: list[str], *, intervals: bool = True) -> str
     Args:
         intervals: whether the part shows any.
     """
-    methods = [method for method in evidence.all_methods if set(method.keys) & set(runs)]
+    shown = [Method(m.axes, [cell for cell in m.finished if cell.key in runs]) for m in evidence.all_methods]
+    methods = [method for method in shown if method.cells]
     counts = [method.counts() for method in methods]
     told = [_several(unit, {count.get(name, 0) for count in counts}) for name, unit in COUNTED.items()]
     text = f"{', '.join(filter(None, told))}."

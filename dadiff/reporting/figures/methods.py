@@ -13,10 +13,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from dadiff.reporting.aggregation import Evidence, Method, case_scalars, varying, weights_for
-from dadiff.reporting.figures.style import letter, log_axis, look_of, panels
+from dadiff.reporting.figures.style import INK, letter, log_axis, look_of, panels
 from dadiff.reporting.labels import method_name, metric_name
 from dadiff.reporting.selection import Selector
 from dadiff.reporting.statistics import Estimate, mean
+
+MANY_DOTS = 2200
+"""In a panel; more are drawn as one picture in svg and pdf, which keeps the files small."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +59,7 @@ class Methods:
 
 
 def _draw_rows(ax: Axes, rows: list[Row], *, log: bool) -> None:
+    many = sum(len(row.dots) for row in rows) > MANY_DOTS
     for y, row in enumerate(rows):
         look = look_of(row.axes)
         if row.estimate is None:
@@ -69,10 +73,11 @@ def _draw_rows(ax: Axes, rows: list[Row], *, log: bool) -> None:
             )
             continue
         offsets = y + 0.32 * (np.arange(len(row.dots)) / max(1, len(row.dots) - 1) - 0.5)
-        ax.plot(row.dots, offsets, ".", color=look.colour, alpha=0.6, ms=5.5, mew=0)
+        ax.plot(row.dots, offsets, ".", color=look.colour, alpha=0.6, ms=5.5, mew=0, rasterized=many)
         bars = [[row.estimate.value - row.estimate.low], [row.estimate.high - row.estimate.value]]
-        ax.plot(row.estimate.value, y, ls="", ms=5, **look.points)
         ax.errorbar(row.estimate.value, y, xerr=bars, fmt="none", color=look.colour, capsize=4, lw=1.6)
+        edge = INK if look.fill == "full" else look.colour  # which makes it stand out from dots of its colour
+        ax.plot(row.estimate.value, y, ls="", ms=5.5, mec=edge, **look.points)
     ax.set_yticks(range(len(rows)), [row.label for row in rows])
     ax.set_ylim(len(rows) - 0.4, -0.6)
     if log and any(row.estimate for row in rows):
