@@ -115,7 +115,7 @@ def test_refusals_of_a_run_are_one_line_too(dadiff, tmp_path):
 @pytest.mark.slow
 def test_a_fleet_needs_a_family_of_robots(dadiff):
     error = refused(dadiff("task=fleet", "system=double_integrator"))
-    assert "double_integrator" in error
+    assert "fleet draws robots from a family, found a single system; choose system=damped_integrators" in error
 
 
 def test_a_sweep_that_another_process_runs_is_refused(dadiff, tmp_path):

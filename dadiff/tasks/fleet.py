@@ -83,7 +83,10 @@ class Fleet:
             ConfigError: if the system is no family.
         """
         if not isinstance(system, Family):
-            raise ConfigError("task: fleet draws robots from a family; choose one, such as system=damped_integrators")
+            raise ConfigError(
+                "task: fleet draws robots from a family, found a single system; "
+                "choose system=damped_integrators or another family"
+            )
         inside = system.ranges.inside(self.interpolation, numpy_generator(self.seed, "robots inside"))
         rng = numpy_generator(self.seed, "robots outside")
         outside = system.ranges.outside(self.extrapolation, self.extrapolation_factor, rng)
