@@ -225,7 +225,7 @@ class TestBadInput:
             LinearSystem([np.eye(2), np.eye(3)], [np.ones((2, 1)), np.ones((3, 1))])
 
     def test_a_single_system(self):
-        with pytest.raises(ConfigError, match="choose one, such as system=damped_integrators"):
+        with pytest.raises(ConfigError, match="found a single system; choose system=damped_integrators"):
             Fleet().target(double_integrator())
 
     def test_a_task_of_one_system_given_a_family(self, tmp_path):
