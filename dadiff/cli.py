@@ -26,7 +26,7 @@ from dadiff.folders import shipped
 def one_run(config: dict[str, Any]) -> None:
     """Execute one resolved configuration, track it, and print its table."""
     from dadiff.config import assemble
-    from dadiff.identity import identify
+    from dadiff.running.identity import identify
 
     parts = assemble(config, config["choices"])
     identity = identify(config, parts)
@@ -37,7 +37,7 @@ def one_run(config: dict[str, Any]) -> None:
     parts["tracking"].close_dead(parts.settings.output_dir)
 
     from dadiff.launching.jobs import run
-    from dadiff.summary import summary
+    from dadiff.running.summary import summary
 
     stored = run(config)
     print(summary([stored]))

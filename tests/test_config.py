@@ -120,7 +120,7 @@ def test_so_is_one_on_the_command_line(override, message):
         ("os.system", "lies outside dadiff"),
         ("builtins.eval", "lies outside dadiff"),
         ("dadiffx.Known", "lies outside dadiff"),
-        ("dadiff.provenance.subprocess.run", "cannot be found"),
+        ("dadiff.running.provenance.subprocess.run", "cannot be found"),
         ("dadiff.folders.Path", "is no class or function of dadiff"),
         ("dadiff.config.build.importlib", "is no class or function of dadiff"),
         ("dadiff.config.build.TARGET", "is no class or function of dadiff"),

@@ -14,7 +14,7 @@ import yaml
 from laws import composed
 
 from dadiff.errors import ConfigError, ExcitationError, StoreError
-from dadiff.experiment import execute, prepare
+from dadiff.running.experiment import execute, prepare
 from dadiff.store import StoredRun
 
 SMALL = (

@@ -10,18 +10,18 @@ import torch
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 
-from dadiff.assembly import Experiment
 from dadiff.config.composed import plain
 from dadiff.config.settings import GROUPS
 from dadiff.datasets import Generated, NpzRecordings, NpzTrajectories
 from dadiff.denoisers import RecordingMLP
 from dadiff.diffusion.schedule import paper_linear
 from dadiff.errors import ConfigError, DataError, InfeasibleError, ShapeError
-from dadiff.experiment import execute
-from dadiff.identity import identify
 from dadiff.launching import register
 from dadiff.projectors import HankelLowRank, Identified, Known
 from dadiff.randomness import torch_generator
+from dadiff.running.assembly import Experiment
+from dadiff.running.experiment import execute
+from dadiff.running.identity import identify
 from dadiff.systems import (
     DampedIntegrators,
     GaussianExcitation,

@@ -11,7 +11,7 @@ import pytest
 import yaml
 from laws import composed
 
-from dadiff.identity import digest, identify
+from dadiff.running.identity import digest, identify
 
 
 @cache

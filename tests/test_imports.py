@@ -87,7 +87,7 @@ def test_light_rooms_load_nothing_heavy():
         "diffusion.samplers",
         "evaluation",
     )
-    light += ("store", "config", "identity", "tracking", "denoisers", "launching", "reporting.cli", "cli")
+    light += ("store", "config", "running.identity", "tracking", "denoisers", "launching", "reporting.cli", "cli")
     assert loaded_by("import " + ", ".join(f"dadiff.{room}" for room in light)) == set()
 
 

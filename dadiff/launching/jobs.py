@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any
 
 from dadiff.config import build
 from dadiff.errors import DadiffError
-from dadiff.identity import identify
 from dadiff.launching.outcome import why
+from dadiff.running.identity import identify
 from dadiff.store import DONE, Cache, Results, StoredRun
 from dadiff.tracking import Tracking
 
 if TYPE_CHECKING:
-    from dadiff.identity import Artefact
+    from dadiff.running.identity import Artefact
 
 
 def tracking_of(config: Mapping[str, Any]) -> Tracking:
@@ -30,7 +30,7 @@ def tracking_of(config: Mapping[str, Any]) -> Tracking:
 
 def run(config: Mapping[str, Any]) -> StoredRun:
     """Run one resolved configuration and mirror it into MLflow; what is done already is only mirrored."""
-    from dadiff.experiment import execute
+    from dadiff.running.experiment import execute
 
     tracking, identity = tracking_of(config), identify(config)
     if identity.denoiser is not None:
@@ -61,7 +61,7 @@ def record_end(config: Mapping[str, Any], status: str, reason: str) -> None:
 
 def train(config: Mapping[str, Any]) -> None:
     """Build the trained denoiser, unless it is cached, and mirror its training into MLflow."""
-    from dadiff.experiment import prepare
+    from dadiff.running.experiment import prepare
 
     tracking, artefact = tracking_of(config), _denoiser(config)
     cache = Cache(config["output_dir"])
@@ -75,14 +75,14 @@ def train(config: Mapping[str, Any]) -> None:
 
 def build_demonstrations(config: Mapping[str, Any]) -> None:
     """Build the demonstrations, unless they are cached."""
-    from dadiff.assembly import Experiment
+    from dadiff.running.assembly import Experiment
 
     _ = Experiment.of(config).demonstrations
 
 
 def build_cases(config: Mapping[str, Any]) -> None:
     """Build the test cases, unless they are cached."""
-    from dadiff.assembly import Experiment
+    from dadiff.running.assembly import Experiment
 
     _ = Experiment.of(config).cases
 

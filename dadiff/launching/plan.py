@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from dadiff.identity import Artefact, Identity, identify
+from dadiff.running.identity import Artefact, Identity, identify
 from dadiff.store import Cache, Cell, Results
 
 KINDS = ("demonstrations", "denoiser", "cases")

@@ -9,7 +9,7 @@ from dadiff.store import Lease
 
 PRELOAD = (
     "dadiff.cli",
-    "dadiff.experiment",
+    "dadiff.running.experiment",
     "mlflow.store.tracking.sqlalchemy_store",
     "mlflow.tracking.client",
     "control",

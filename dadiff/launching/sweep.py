@@ -11,11 +11,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from dadiff.identity import digest
 from dadiff.launching import jobs
 from dadiff.launching.outcome import Outcome
 from dadiff.launching.plan import Plan, PlannedCell, Preparation
 from dadiff.launching.work import Work
+from dadiff.running.identity import digest
 from dadiff.store import DONE, Cache, Cell, Results, Sweep, Sweeps
 from dadiff.tracking import Tracking, is_tracked
 

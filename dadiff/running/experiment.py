@@ -15,7 +15,6 @@ import numpy as np
 import torch
 import yaml
 
-from dadiff.assembly import Experiment
 from dadiff.diffusion.chain import Samples, sample
 from dadiff.diffusion.enforcement import Enforcement
 from dadiff.errors import NotApplicableError
@@ -23,8 +22,9 @@ from dadiff.evaluation import replay, tracking_errors
 from dadiff.evaluation.mahalanobis import MahalanobisDistance
 from dadiff.evaluation.records import ChainRecorder, Snapshots, headline, merged, tables
 from dadiff.projectors import AdmissibleSet, Known, Projection
-from dadiff.provenance import provenance
 from dadiff.randomness import numpy_generator, torch_generator
+from dadiff.running.assembly import Experiment
+from dadiff.running.provenance import provenance
 from dadiff.store import StoredRun
 from dadiff.systems import LinearSystem, Robots
 from dadiff.tasks import Scores

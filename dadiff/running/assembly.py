@@ -15,7 +15,7 @@ from dadiff.datasets.cached import load_data, save_data
 from dadiff.denoisers.checkpoints import load
 from dadiff.denoisers.learning import train
 from dadiff.errors import ConfigError
-from dadiff.identity import Artefact, Identity, identify
+from dadiff.running.identity import Artefact, Identity, identify
 from dadiff.store import Cache, Results
 from dadiff.systems import LinearSystem
 from dadiff.tasks import Cases, Demonstrations

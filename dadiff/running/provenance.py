@@ -33,7 +33,7 @@ def provenance(device: str, started: float) -> dict[str, Any]:
 
 def commit() -> str | None:
     """The git commit of the source, with `+changes` if files differ from it; None for an installed package."""
-    source = Path(__file__).parent.parent
+    source = Path(__file__).parent.parent.parent
     if not (source / ".git").exists():
         return None
     git = ["git", "-C", str(source)]
