@@ -30,13 +30,13 @@ from dadiff.diffusion.schedule import paper_linear
 from dadiff.randomness import numpy_generator, torch_generator
 from dadiff.systems import double_integrator
 from dadiff.tasks import LQR
-from dadiff.trajectory import Layout
+from dadiff.trajectory import TrajectoryLayout
 from dadiff.trajectory.coordinates import Coordinates, physical, standardised
 
 BATCH = 64
 MATRIX = 2048
 CONF = Path(__file__).parents[1] / "conf"
-LQR_LAYOUT = Layout(state_dim=4, input_dim=2, horizon=30)
+LQR_LAYOUT = TrajectoryLayout(state_dim=4, input_dim=2, horizon=30)
 SCHEDULE = paper_linear()
 
 
@@ -46,7 +46,7 @@ def seconds(action: Callable[[], object]) -> float:
     return time.perf_counter() - begun
 
 
-def multiply_adds(recipe: EncoderDecoder, layout: Layout) -> int:
+def multiply_adds(recipe: EncoderDecoder, layout: TrajectoryLayout) -> int:
     """Of one sample and call of the paper's network: six convolutions, two linear maps."""
     length, features, C = layout.horizon + 1, layout.state_dim + layout.input_dim, recipe.channels
     convolutions = length * recipe.kernel * (2 * features * C + 4 * C * C)

@@ -42,10 +42,10 @@ def test_the_shortest_recording_gives_n_plus_mT_columns(system):
 
 
 def test_lengths_of_the_paper():
-    from dadiff.trajectory import Layout
+    from dadiff.trajectory import TrajectoryLayout
 
-    assert minimum_length(Layout(4, 2, 30)) == 93
-    assert identity_length(Layout(4, 2, 30)) == 213
+    assert minimum_length(TrajectoryLayout(4, 2, 30)) == 93
+    assert identity_length(TrajectoryLayout(4, 2, 30)) == 213
 
 
 def test_a_recording_shorter_than_the_horizon_is_told_how_long_it_must_be(system):

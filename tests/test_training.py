@@ -20,9 +20,9 @@ from dadiff.denoisers.training import Training
 from dadiff.diffusion.schedule import paper_linear
 from dadiff.errors import CheckpointError, ConfigError, DataError, ShapeError
 from dadiff.randomness import numpy_generator
-from dadiff.trajectory import Layout
+from dadiff.trajectory import TrajectoryLayout
 
-LAYOUT = Layout(state_dim=2, input_dim=1, horizon=4)
+LAYOUT = TrajectoryLayout(state_dim=2, input_dim=1, horizon=4)
 SCHEDULE = paper_linear(num_steps=100, slope=0.01)
 RECIPES = [MLP(width=16, blocks=1), EncoderDecoder(channels=8, latent_dim=4)]
 SHORT = Training(steps=24, batch_size=8, learning_rate=1e-2, warmup=3, ema_decay=0.9, checkpoint_every=7)

@@ -19,7 +19,7 @@ from dadiff.denoisers.learned import NetworkDenoiser
 from dadiff.denoisers.recipes import Recipe
 from dadiff.diffusion.schedule import Schedule
 from dadiff.errors import CheckpointError
-from dadiff.trajectory import Layout
+from dadiff.trajectory import TrajectoryLayout
 
 
 def save(denoiser: NetworkDenoiser, path: Path) -> None:
@@ -27,7 +27,9 @@ def save(denoiser: NetworkDenoiser, path: Path) -> None:
     write(path, denoiser.state_dict(), denoiser.description)
 
 
-def load(path: Path, recipe: Recipe, layout: Layout, environment_dim: int, schedule: Schedule) -> NetworkDenoiser:
+def load(
+    path: Path, recipe: Recipe, layout: TrajectoryLayout, environment_dim: int, schedule: Schedule
+) -> NetworkDenoiser:
     """The stored denoiser.
 
     Raises:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from dadiff.diffusion.schedule import Schedule
 from dadiff.errors import CheckpointError
-from dadiff.trajectory import Layout
+from dadiff.trajectory import TrajectoryLayout
 
 if TYPE_CHECKING:
     from dadiff.denoisers.recipes import Recipe
@@ -19,7 +19,7 @@ FORMAT = 1
 Description = Mapping[str, int | float | str]
 
 
-def describe(recipe: Recipe, layout: Layout, environment_dim: int, schedule: Schedule) -> Description:
+def describe(recipe: Recipe, layout: TrajectoryLayout, environment_dim: int, schedule: Schedule) -> Description:
     """Flat, in the letters of the paper: n, m, T, c, L, a digest of beta, and the recipe with its fields."""
     return {
         "format": FORMAT,

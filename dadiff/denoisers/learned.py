@@ -18,7 +18,7 @@ from dadiff.denoisers.prediction import prediction
 from dadiff.denoisers.recipes import Recipe
 from dadiff.diffusion.schedule import Schedule
 from dadiff.errors import ShapeError
-from dadiff.trajectory import Layout
+from dadiff.trajectory import TrajectoryLayout
 
 CHUNK = 1024  # trajectories a network call holds activations for
 
@@ -43,7 +43,7 @@ class NetworkDenoiser(nn.Module):
         self,
         network: nn.Module,
         recipe: Recipe,
-        layout: Layout,
+        layout: TrajectoryLayout,
         environment_dim: int,
         schedule: Schedule,
         generator: torch.Generator,

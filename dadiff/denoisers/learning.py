@@ -32,7 +32,7 @@ from dadiff.denoisers.training import Training
 from dadiff.diffusion.schedule import Schedule
 from dadiff.errors import DataError, ShapeError
 from dadiff.randomness import torch_generator
-from dadiff.trajectory import Layout
+from dadiff.trajectory import TrajectoryLayout
 
 Augment = Callable[[Tensor, torch.Generator], Tensor]
 
@@ -44,7 +44,7 @@ log = logging.getLogger(__name__)
 
 def train(
     recipe: Recipe,
-    layout: Layout,
+    layout: TrajectoryLayout,
     schedule: Schedule,
     training: Training,
     trajectories: np.ndarray,
@@ -267,7 +267,7 @@ def deferred_interrupt() -> Iterator[list[bool]]:
 
 
 def _untrained(
-    recipe: Recipe, layout: Layout, schedule: Schedule, training: Training, environment: np.ndarray
+    recipe: Recipe, layout: TrajectoryLayout, schedule: Schedule, training: Training, environment: np.ndarray
 ) -> NetworkDenoiser:
     generator = torch_generator(training.seed, "initialisation")
     denoiser = recipe.build(layout, environment.shape[-1], schedule, generator)
@@ -286,7 +286,7 @@ def _progress_bar(training: Training, state: State, *, shown: bool) -> tqdm:
     return tqdm(total=training.steps, initial=state.step, desc="training", unit="step", disable=not shown)
 
 
-def _check_data(layout: Layout, trajectories: np.ndarray, environment: np.ndarray) -> None:
+def _check_data(layout: TrajectoryLayout, trajectories: np.ndarray, environment: np.ndarray) -> None:
     layout.check(trajectories)
     if trajectories.ndim != 2 or environment.ndim != 2 or len(trajectories) != len(environment):
         raise ShapeError(

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from dadiff.trajectory import Layout
+from dadiff.trajectory import TrajectoryLayout
 
 STEP_FEATURES = 64
 EMBEDDING = 128
@@ -76,7 +76,7 @@ class RecordingNetwork(nn.Module):
     E = [x_init; x_target; (x(t), u(t), x(t+1) - x(t)) for each t].
     """
 
-    def __init__(self, layout: Layout, width: int, blocks: int, context: int) -> None:
+    def __init__(self, layout: TrajectoryLayout, width: int, blocks: int, context: int) -> None:
         super().__init__()
         self.ends, self.transition = 2 * layout.state_dim, 2 * layout.state_dim + layout.input_dim
         self.embed = nn.Sequential(nn.Linear(self.transition, EMBEDDING), nn.SiLU(), nn.Linear(EMBEDDING, EMBEDDING))
@@ -109,7 +109,9 @@ class EncoderDecoderNetwork(nn.Module):
     Time steps are the n + m channels [x(t); u(t)] for t = 0..T, where u(T), which does not exist, is 0.
     """
 
-    def __init__(self, layout: Layout, environment_dim: int, channels: int, kernel: int, latent_dim: int) -> None:
+    def __init__(
+        self, layout: TrajectoryLayout, environment_dim: int, channels: int, kernel: int, latent_dim: int
+    ) -> None:
         super().__init__()
         self.layout, self.channels, self.length = layout, channels, layout.horizon + 1
         features = layout.state_dim + layout.input_dim

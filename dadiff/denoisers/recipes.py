@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, ClassVar, Protocol
 from dadiff.denoisers.prediction import PredictionChoice
 from dadiff.diffusion.schedule import Schedule
 from dadiff.errors import ConfigError
-from dadiff.trajectory import Layout
+from dadiff.trajectory import TrajectoryLayout
 
 if TYPE_CHECKING:
     import torch
@@ -29,7 +29,7 @@ class Recipe(Protocol):
         ...
 
     def build(
-        self, layout: Layout, environment_dim: int, schedule: Schedule, generator: torch.Generator
+        self, layout: TrajectoryLayout, environment_dim: int, schedule: Schedule, generator: torch.Generator
     ) -> NetworkDenoiser:
         """The untrained denoiser; all its weights are drawn from the generator."""
         ...
@@ -65,7 +65,7 @@ class EncoderDecoder:
             raise ConfigError(f"denoiser encoder_decoder: kernel is {self.kernel}; it must be odd to keep the horizon")
 
     def build(
-        self, layout: Layout, environment_dim: int, schedule: Schedule, generator: torch.Generator
+        self, layout: TrajectoryLayout, environment_dim: int, schedule: Schedule, generator: torch.Generator
     ) -> NetworkDenoiser:
         """See `Recipe.build`."""
         from dadiff.denoisers.learned import NetworkDenoiser, on_meta
@@ -96,7 +96,7 @@ class MLP:
         _check_positive("mlp", width=self.width, blocks=self.blocks)
 
     def build(
-        self, layout: Layout, environment_dim: int, schedule: Schedule, generator: torch.Generator
+        self, layout: TrajectoryLayout, environment_dim: int, schedule: Schedule, generator: torch.Generator
     ) -> NetworkDenoiser:
         """See `Recipe.build`."""
         from dadiff.denoisers.learned import NetworkDenoiser, on_meta
@@ -129,7 +129,7 @@ class RecordingMLP:
         _check_positive("mlp_recording", width=self.width, blocks=self.blocks, context=self.context)
 
     def build(
-        self, layout: Layout, environment_dim: int, schedule: Schedule, generator: torch.Generator
+        self, layout: TrajectoryLayout, environment_dim: int, schedule: Schedule, generator: torch.Generator
     ) -> NetworkDenoiser:
         """See `Recipe.build`."""
         from dadiff.denoisers.learned import NetworkDenoiser, on_meta

@@ -16,7 +16,7 @@ from dadiff.projectors.sets import AdmissibleSet, InitialState, Projection, Roll
 from dadiff.systems import LinearSystem, Recording
 from dadiff.trajectory.coordinates import Coordinates
 from dadiff.trajectory.hankel import identity_length, trajectory_matrix
-from dadiff.trajectory.layout import Layout
+from dadiff.trajectory.layout import TrajectoryLayout
 from dadiff.trajectory.response import dynamics_matrix, trajectory_map
 from dadiff.trajectory.subspace import null_space, numerical_rank, rank_tolerance
 
@@ -37,7 +37,7 @@ class Projector(Protocol):
     needs: ClassVar[str | None]
 
     def fit(
-        self, layout: Layout, system: LinearSystem | None = None, recording: Recording | None = None
+        self, layout: TrajectoryLayout, system: LinearSystem | None = None, recording: Recording | None = None
     ) -> Fitted | None: ...
 
 
@@ -47,7 +47,9 @@ class NoProjector:
 
     needs: ClassVar[str | None] = None
 
-    def fit(self, layout: Layout, system: LinearSystem | None = None, recording: Recording | None = None) -> None:
+    def fit(
+        self, layout: TrajectoryLayout, system: LinearSystem | None = None, recording: Recording | None = None
+    ) -> None:
         """Nothing to fit."""
 
 
@@ -63,7 +65,7 @@ class Known:
     needs: ClassVar[str | None] = "system"
 
     def fit(
-        self, layout: Layout, system: LinearSystem | None = None, recording: Recording | None = None
+        self, layout: TrajectoryLayout, system: LinearSystem | None = None, recording: Recording | None = None
     ) -> AdmissibleSet:
         """The image of F."""
         system = _required(system, "known", "system")
@@ -83,7 +85,7 @@ class Hankel:
     needs: ClassVar[str | None] = "recording"
 
     def fit(
-        self, layout: Layout, system: LinearSystem | None = None, recording: Recording | None = None
+        self, layout: TrajectoryLayout, system: LinearSystem | None = None, recording: Recording | None = None
     ) -> AdmissibleSet:
         """The image of H."""
         recording = _required(recording, "hankel", "recording")
@@ -108,7 +110,7 @@ class HankelLowRank:
     needs: ClassVar[str | None] = "recording"
 
     def fit(
-        self, layout: Layout, system: LinearSystem | None = None, recording: Recording | None = None
+        self, layout: TrajectoryLayout, system: LinearSystem | None = None, recording: Recording | None = None
     ) -> AdmissibleSet:
         """The leading n + mT directions of H."""
         recording = _required(recording, "hankel_lowrank", "recording")
@@ -125,7 +127,7 @@ class Identified:
     needs: ClassVar[str | None] = "recording"
 
     def fit(
-        self, layout: Layout, system: LinearSystem | None = None, recording: Recording | None = None
+        self, layout: TrajectoryLayout, system: LinearSystem | None = None, recording: Recording | None = None
     ) -> AdmissibleSet:
         """The image of the estimated F."""
         recording = _required(recording, "identified", "recording")
@@ -140,7 +142,9 @@ class RolloutProjector:
     needs: ClassVar[str | None] = "system"
     initial_state: ClassVar[InitialState] = "fixed"
 
-    def fit(self, layout: Layout, system: LinearSystem | None = None, recording: Recording | None = None) -> Rollout:
+    def fit(
+        self, layout: TrajectoryLayout, system: LinearSystem | None = None, recording: Recording | None = None
+    ) -> Rollout:
         """The map u -> F [x_init; u]."""
         system = _required(system, "rollout", "system")
         return Rollout(
@@ -166,12 +170,12 @@ def identify(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
     return AB[..., :n], AB[..., n:]
 
 
-def _image_of_dynamics(A: np.ndarray, B: np.ndarray, layout: Layout) -> AdmissibleSet:
+def _image_of_dynamics(A: np.ndarray, B: np.ndarray, layout: TrajectoryLayout) -> AdmissibleSet:
     basis = null_space(dynamics_matrix(A, B, layout.horizon))
     return AdmissibleSet(layout, basis, notes={"rank": layout.rank})
 
 
-def _decompose(recording: Recording, layout: Layout) -> tuple[np.ndarray, np.ndarray, int]:
+def _decompose(recording: Recording, layout: TrajectoryLayout) -> tuple[np.ndarray, np.ndarray, int]:
     """Left singular vectors, singular values and rank of the stack H.
 
     Raises:

@@ -15,7 +15,7 @@ import numpy as np
 
 from dadiff.errors import ConfigError, ExcitationError, ShapeError
 from dadiff.trajectory.coordinates import Coordinates, physical
-from dadiff.trajectory.layout import Array, Layout
+from dadiff.trajectory.layout import Array, TrajectoryLayout
 from dadiff.trajectory.subspace import column_basis, null_space, numerical_rank
 
 InitialState = Literal["free", "fixed"]
@@ -71,7 +71,7 @@ class AdmissibleSet:
         notes: what the projector can say of the set, by name: rank, singular-value gap.
     """
 
-    layout: Layout
+    layout: TrajectoryLayout
     basis: np.ndarray = field(repr=False)
     lift: np.ndarray | None = field(default=None, repr=False)
     notes: dict[str, float] = field(default_factory=dict)
@@ -120,7 +120,7 @@ class Rollout:
         notes: as for `AdmissibleSet`.
     """
 
-    layout: Layout
+    layout: TrajectoryLayout
     F: np.ndarray = field(repr=False)
     notes: dict[str, float] = field(default_factory=dict)
 

@@ -20,7 +20,7 @@ from dadiff.store import Cache, Results
 from dadiff.systems import LinearSystem
 from dadiff.tasks import Cases, Demonstrations
 from dadiff.trajectory.coordinates import Coordinates, physical, standardised
-from dadiff.trajectory.layout import Layout
+from dadiff.trajectory.layout import TrajectoryLayout
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Experiment:
         return target
 
     @cached_property
-    def layout(self) -> Layout:
+    def layout(self) -> TrajectoryLayout:
         """Of this task's trajectories."""
         return self.target.layout(self.parts["task"].horizon)
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from dadiff.errors import ConfigError, ShapeError
-from dadiff.trajectory.layout import Layout
+from dadiff.trajectory.layout import TrajectoryLayout
 from dadiff.trajectory.response import layout_of, simulate, trajectory_map
 
 
@@ -57,7 +57,7 @@ class LinearSystem:
         """Leading dimensions: () for a single system."""
         return self.A.shape[:-2]
 
-    def layout(self, horizon: int) -> Layout:
+    def layout(self, horizon: int) -> TrajectoryLayout:
         """The layout of this system's trajectories over T inputs."""
         return layout_of(self.A, self.B, horizon)
 

@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 
 from dadiff.errors import ConfigError
-from dadiff.trajectory.layout import Array, Layout
+from dadiff.trajectory.layout import Array, TrajectoryLayout
 
 CoordinateChoice = Literal["physical", "standardised"]
 
@@ -47,12 +47,12 @@ def _like(vector: np.ndarray, array: Array) -> Array:
     return vector if isinstance(array, np.ndarray) else array.new_tensor(vector)
 
 
-def physical(layout: Layout) -> Coordinates:
+def physical(layout: TrajectoryLayout) -> Coordinates:
     """The identity: z = tau, as in the paper."""
     return Coordinates(np.zeros(layout.size), np.ones(layout.size))
 
 
-def standardised(layout: Layout, trajectories: np.ndarray) -> Coordinates:
+def standardised(layout: TrajectoryLayout, trajectories: np.ndarray) -> Coordinates:
     """Mean 0 and deviation 1 per state and input channel, over trajectories (N, d) and time alike.
 
     One scale a channel, not an entry: entries that never vary, such as u(T-1) = 0, would have none.

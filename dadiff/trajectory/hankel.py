@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from dadiff.errors import ExcitationError
-from dadiff.trajectory.layout import Layout
+from dadiff.trajectory.layout import TrajectoryLayout
 
 
 def windows(signal: np.ndarray, depth: int) -> np.ndarray:
@@ -18,17 +18,17 @@ def windows(signal: np.ndarray, depth: int) -> np.ndarray:
     return np.moveaxis(np.lib.stride_tricks.sliding_window_view(signal, depth, axis=-2), -1, -2)
 
 
-def minimum_length(layout: Layout, count: int = 1) -> int:
+def minimum_length(layout: TrajectoryLayout, count: int = 1) -> int:
     """The S from which `count` recordings give the n + mT columns that span the dynamics."""
     return layout.horizon - 1 + -(-layout.rank // count)
 
 
-def identity_length(layout: Layout, count: int = 1) -> int:
+def identity_length(layout: TrajectoryLayout, count: int = 1) -> int:
     """The S from which noisy columns fill R^d, so that H H† is the identity: d columns."""
     return layout.horizon - 1 + -(-layout.size // count)
 
 
-def trajectory_matrix(states: np.ndarray, inputs: np.ndarray, layout: Layout) -> np.ndarray:
+def trajectory_matrix(states: np.ndarray, inputs: np.ndarray, layout: TrajectoryLayout) -> np.ndarray:
     """H = [H_{T+1}(x); H_T(u)] of shape (*robots, d, count (S - T + 1)), eq. (10).
 
     Args:

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from dadiff.trajectory.layout import Layout
+from dadiff.trajectory.layout import TrajectoryLayout
 
 
-def layout_of(A: np.ndarray, B: np.ndarray, horizon: int) -> Layout:
+def layout_of(A: np.ndarray, B: np.ndarray, horizon: int) -> TrajectoryLayout:
     """The layout of trajectories of (A (..., n, n), B (..., n, m)) over T inputs."""
-    return Layout(A.shape[-1], B.shape[-1], horizon)
+    return TrajectoryLayout(A.shape[-1], B.shape[-1], horizon)
 
 
 def powers(A: np.ndarray, horizon: int) -> np.ndarray:
