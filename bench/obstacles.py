@@ -39,8 +39,10 @@ def main(count: int = 10_000, oracle_count: int = 50, repeats: int = 2) -> None:
     environments, _ = task.distribution_for(0.1).sample(count, np.random.default_rng(0))
     problem = task.problem(environments, 0.1)
     first = problem.take(np.arange(oracle_count))
+    batched.solve(first)  # compiles, or loads machine code
     found, seconds, elapsed = timed(batched.solve, problem, repeats)
     _, alone_seconds, _ = timed(batched.solve, first, repeats)
+    single = [timed(batched.solve, problem.take(np.array([i])), repeats)[1] for i in range(oracle_count)]
     oracle, oracle_seconds, _ = timed(ipopt.solve, first)
     each, oracle_each = seconds / count, oracle_seconds / oracle_count
     ratio = found.cost[:oracle_count] / oracle.cost
@@ -48,6 +50,7 @@ def main(count: int = 10_000, oracle_count: int = 50, repeats: int = 2) -> None:
     unsolved = int((~found.solved).sum())
     print(f"batched: {count} environments in {elapsed:.1f} s ({seconds:.1f} s of processor time), unsolved {unsolved}")
     print(f"  obstacle-free optimum in the way of a disc: {(~problem.feasible(obstacle_free(problem))).mean():.1%}")
+    print(f"  one environment alone: median {1e3 * np.median(single):.1f} ms, slowest {1e3 * max(single):.1f} ms")
     print(f"ipopt: {oracle_each:.3f} s an environment over its starts, unsolved {int((~oracle.solved).sum())}")
     print(f"faster than ipopt, per environment, in the large batch: {oracle_each / each:.0f} times")
     print(f"faster than ipopt, the same {oracle_count} environments alone: {oracle_seconds / alone_seconds:.0f} times")

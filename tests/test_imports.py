@@ -13,7 +13,7 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "dadiff"
-HEAVY = {"torch", "mlflow", "control", "cvxpy", "casadi", "matplotlib"}
+HEAVY = {"torch", "mlflow", "control", "cvxpy", "casadi", "matplotlib", "numba"}
 OPEN = {"errors", "randomness", "folders"}
 
 

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import pytest
 
 from dadiff.errors import ConfigError
-from dadiff.experts.obstacles import batched
-from dadiff.experts.obstacles.lagrangian import Lagrangian
-from dadiff.experts.obstacles.pentadiagonal import factorise, squared_second_difference
+from dadiff.experts.obstacles import batched, kernels
 from dadiff.experts.obstacles.problem import ObstacleProblem, time_step_of
-from dadiff.experts.obstacles.quadratic import Quadratic, batch_last, obstacle_free
+from dadiff.experts.obstacles.quadratic import obstacle_free
 from dadiff.systems import LinearSystem, double_integrator
 from dadiff.tasks.obstacles import Obstacles
 
@@ -23,11 +24,11 @@ def draw(count: int, seed: int = 0, **settings: object) -> ObstacleProblem:
 
 
 def dense(diagonal: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """The block pentadiagonal matrix of one system, (2K, 2K)."""
+    """The block pentadiagonal matrix with blocks [[a, b], [b, d]], (2K, 2K)."""
     K = len(diagonal)
     M = np.zeros((K, 2, K, 2))
-    for k in range(K):
-        M[k, :, k] = diagonal[k]
+    for k, (a, b, d) in enumerate(diagonal):
+        M[k, :, k] = [[a, b], [b, d]]
         for below, entry in ((1, first), (2, second)):
             if k >= below:
                 M[k, :, k - below] = M[k - below, :, k] = entry[k] * np.eye(2)
@@ -37,30 +38,32 @@ def dense(diagonal: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.nda
 @pytest.mark.parametrize("K", [1, 2, 3, 12])
 def test_block_factor_solves_as_dense_numpy(K: int) -> None:
     rng = np.random.default_rng(K)
-    root = rng.normal(size=(K, 2, 2, 5))
-    diagonal = np.einsum("kijn,kljn->kiln", root, root) + 9 * np.eye(2)[:, :, None]
-    first, second = rng.normal(size=(2, K))
-    right = rng.normal(size=(K, 2, 5))
-    factor = factorise(diagonal, first, second)
-    found = factor.solve(right)
-    for n in range(5):
-        M = dense(diagonal[..., n], first, second)
-        np.testing.assert_allclose(M @ found[..., n].ravel(), right[..., n].ravel(), atol=1e-12)
-        assert factor.definite[n] == (np.linalg.eigvalsh(M)[0] > 0)
+    for _ in range(5):
+        first, second = rng.normal(size=(2, K))
+        diagonal = rng.normal(size=(K, 3)) + np.array([9, 0, 9])
+        M, right = dense(diagonal, first, second), rng.normal(size=(K, 2))
+        inverse, lower, found = np.empty((K, 3)), np.empty((K, 4)), right.copy()
+        assert kernels.factorise(diagonal, first, second, inverse, lower)
+        kernels.substitute(inverse, lower, second, found)
+        np.testing.assert_allclose(M @ found.ravel(), right.ravel(), atol=1e-12)
 
 
-def test_block_factor_tells_which_systems_are_not_definite() -> None:
-    diagonal = np.eye(2)[None, :, :, None] * np.array([3.0, 3.0, -1.0]) * np.ones((6, 1, 1, 1))
-    diagonal[4, 1, 1, 1] = -0.5
-    factor = factorise(diagonal, np.full(6, 0.5), np.full(6, 0.2))
-    np.testing.assert_array_equal(factor.definite, [True, False, False])
+@pytest.mark.parametrize(("at", "pivot", "definite"), [(0, 3.0, True), (0, -1.0, False), (4, -0.5, False)])
+def test_block_factor_tells_whether_the_matrix_is_definite(at: int, pivot: float, definite: bool) -> None:
+    diagonal = np.tile([3.0, 0.0, 3.0], (6, 1))
+    diagonal[at, 2] = pivot
+    first, second = np.full(6, 0.5), np.full(6, 0.2)
+    assert definite == (np.linalg.eigvalsh(dense(diagonal, first, second))[0] > 0)
+    assert kernels.factorise(diagonal, first, second, np.empty((6, 3)), np.empty((6, 4))) == definite
 
 
-def test_squared_second_difference_is_that_of_the_dense_matrix() -> None:
-    band = squared_second_difference(5)
-    np.testing.assert_array_equal(band.diagonal, [6, 6, 6, 5, 1])
-    np.testing.assert_array_equal(band.first, [0, -4, -4, -4, -2])
-    np.testing.assert_array_equal(band.second, [0, 0, 1, 1, 1])
+@pytest.mark.parametrize("K", [1, 2, 3, 7])
+def test_the_hessian_of_second_differences_is_that_of_the_dense_matrix(K: int) -> None:
+    D = np.eye(K) - 2 * np.eye(K, k=-1) + np.eye(K, k=-2)
+    nothing, diagonal = np.zeros((K, 0)), np.empty((K, 3))
+    one = kernels.One(np.zeros((K + 2, 2)), np.zeros(K + 2), np.zeros((0, 2)), np.zeros(0), 0.7)
+    kernels.blocks(one, np.zeros((K + 2, 2)), nothing, 1.0, 1.0, diagonal)
+    np.testing.assert_allclose(dense(diagonal, *kernels.band(K, 0.7)), np.kron(1.4 * D.T @ D, np.eye(2)), atol=1e-12)
 
 
 def test_obstacle_free_optimum_is_the_least_squares_optimum_in_closed_form() -> None:
@@ -78,50 +81,68 @@ def test_obstacle_free_optimum_is_the_least_squares_optimum_in_closed_form() -> 
         np.testing.assert_allclose(found[i], free + G @ u, atol=1e-9)
 
 
-@pytest.fixture
-def lagrangian() -> tuple[Lagrangian, np.ndarray]:
-    problem = draw(3, horizon=12, waypoint_times=[5, 10])
-    L = Lagrangian.of(problem, 2.0)
-    rng = np.random.default_rng(1)
-    L = Lagrangian(L.f, L.centre, L.radius, rng.uniform(0, 0.5, size=L.multiplier.shape), L.penalty)
-    path = np.moveaxis(obstacle_free(problem), 0, -1)
-    return L, path + 0.1 * rng.normal(size=path.shape)
+Point = tuple[kernels.One, np.ndarray, np.ndarray]
 
 
-def test_gradient_agrees_with_finite_differences(lagrangian: tuple[Lagrangian, np.ndarray]) -> None:
-    L, p = lagrangian
-    g, offset = L.constraint(p)
-    gradient = L.gradient(p, L.force(g), offset)
-    numeric, h = np.empty_like(gradient), 1e-6
-    for k in range(len(gradient)):
+@pytest.fixture(params=range(3))
+def point(request: pytest.FixtureRequest) -> Point:
+    """An environment, a path that enters discs, and multipliers; the penalty is 2."""
+    problem = draw(3, horizon=12, waypoint_times=[5, 10]).take(np.array([request.param]))
+    rng = np.random.default_rng(request.param)
+    one = kernels.One(problem.goal[0], problem.weight[0], problem.centre[0], problem.radius[0], problem.kappa)
+    path = obstacle_free(problem)[0] + 0.1 * rng.normal(size=(13, 2))
+    return one, path, rng.uniform(0, 0.5, size=(11, 4))
+
+
+def value(point: Point, p: np.ndarray) -> float:
+    """L(p)."""
+    one, _, multiplier = point
+    s = np.empty_like(multiplier)
+    kernels.force(one, p, multiplier, 2.0, s)
+    return kernels.lagrangian(one, p, multiplier, 2.0, s)
+
+
+def slope(point: Point, p: np.ndarray) -> np.ndarray:
+    """dL/dq, (K, 2)."""
+    one, _, multiplier = point
+    s, found = np.empty_like(multiplier), np.empty((len(multiplier), 2))
+    kernels.force(one, p, multiplier, 2.0, s)
+    kernels.gradient(one, p, s, found)
+    return found
+
+
+def differences(function: Callable[[np.ndarray], np.ndarray | float], p: np.ndarray, h: float = 1e-6) -> np.ndarray:
+    """Central differences along q = p(2..T), stacked along the first axis."""
+    rows = []
+    for k in range(2, len(p)):
         for axis in range(2):
             ahead, behind = p.copy(), p.copy()
-            ahead[k + 2, axis] += h
-            behind[k + 2, axis] -= h
-            numeric[k, axis] = (L.value(ahead) - L.value(behind)) / (2 * h)
-    np.testing.assert_allclose(gradient, numeric, atol=1e-6)
+            ahead[k, axis] += h
+            behind[k, axis] -= h
+            rows.append((np.asarray(function(ahead)) - np.asarray(function(behind))) / (2 * h))
+    return np.array(rows)
 
 
-def test_newton_hessian_agrees_with_finite_differences(lagrangian: tuple[Lagrangian, np.ndarray]) -> None:
-    L, p = lagrangian
-    g, offset = L.constraint(p)
-    blocks, concave = L.blocks(L.force(g), offset)
-    blocks[:, [0, 1], [0, 1]] -= concave[:, None]
-    f, h = L.f, 1e-6
-    for n in range(p.shape[-1]):
-        H = dense(blocks[..., n], 2 * f.kappa * f.band.first, 2 * f.kappa * f.band.second)
-        one, q = L.take(np.array([n])), p[..., [n]]
-        for k in range(len(g)):
-            ahead, behind = q.copy(), q.copy()
-            ahead[k + 2, 0] += h
-            behind[k + 2, 0] -= h
-            column = (_gradient(one, ahead) - _gradient(one, behind)) / (2 * h)
-            np.testing.assert_allclose(H[:, 2 * k], column.ravel(), atol=1e-5)
+def test_gradient_agrees_with_finite_differences(point: Point) -> None:
+    numeric = differences(lambda p: value(point, p), point[1])
+    np.testing.assert_allclose(slope(point, point[1]).ravel(), numeric, atol=1e-6)
 
 
-def _gradient(L: Lagrangian, p: np.ndarray) -> np.ndarray:
-    g, offset = L.constraint(p)
-    return L.gradient(p, L.force(g), offset)
+def test_newton_hessian_agrees_with_finite_differences(point: Point) -> None:
+    one, p, multiplier = point
+    s, diagonal = np.empty_like(multiplier), np.empty((len(multiplier), 3))
+    kernels.force(one, p, multiplier, 2.0, s)
+    assert (s > 0).any()
+    kernels.blocks(one, p, s, 2.0, 1.0, diagonal)
+    numeric = differences(lambda q: slope(point, q), p).reshape(2 * len(s), -1)
+    np.testing.assert_allclose(dense(diagonal, *kernels.band(len(s), one.kappa)), numeric, atol=1e-5)
+
+
+def test_a_function_that_finds_no_place_for_its_machine_code_still_runs() -> None:
+    """As in a read-only installation without a home: here, because its source lies in no file."""
+    names: dict[str, Any] = {}
+    exec("def double(x):\n    return 2 * x", names)
+    assert kernels.compiled(names["double"])(3) == 6
 
 
 @pytest.fixture(scope="module", params=["default", "uniform", "hard"])
@@ -145,10 +166,18 @@ def test_rolling_out_the_inputs_reproduces_the_positions(solved: tuple) -> None:
     np.testing.assert_array_equal(found.inputs[:, -1], 0)
 
 
+def free_gradient(problem: ObstacleProblem, i: int, p: np.ndarray) -> np.ndarray:
+    """df/dq of environment i, (K, 2)."""
+    none, found = np.zeros((len(p) - 2, 0)), np.empty((len(p) - 2, 2))
+    one = kernels.One(problem.goal[i], problem.weight[i], np.zeros((0, 2)), np.zeros(0), problem.kappa)
+    kernels.gradient(one, p, none, found)
+    return found
+
+
 def test_solutions_are_stationary_given_the_discs_that_they_touch(solved: tuple) -> None:
     """KKT: the gradient of the cost is a sum of pushes >= 0 along the normals of touched discs."""
     problem, found = solved
-    gradient = np.moveaxis(Quadratic.of(problem).gradient(batch_last(found.positions)), -1, 0)
+    gradient = np.array([free_gradient(problem, i, p) for i, p in enumerate(found.positions)])
     offset = found.positions[:, 2:, None] - problem.centre[:, None]
     touched = (problem.penetration(found.positions) > -1e-5) & (problem.radius[:, None] > 0)
     normal = offset / np.linalg.norm(offset, axis=-1, keepdims=True)

@@ -2,7 +2,7 @@
 
 One local solve is the method of multipliers (Nocedal & Wright, Algorithm 17.4): Newton with Armijo backtracking on the
 augmented Lagrangian; where its decrement is small the multipliers move on, and the penalty grows where the violation
-fell too little. Every environment keeps its own pace, and leaves the batch when it is done.
+fell too little. `kernels` holds it, compiled, on one thread: workers run side by side.
 
 Which side of each disc to pass is settled by trying: from the first optimum every set of the discs it touches is
 flipped to the other side, then single discs at the incumbent, until none gets cheaper.
@@ -14,17 +14,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dadiff.experts.obstacles.lagrangian import Lagrangian
 from dadiff.experts.obstacles.problem import TOLERANCE, ObstacleProblem, Solutions, Status, solutions
-from dadiff.experts.obstacles.quadratic import batch_last, obstacle_free, select
+from dadiff.experts.obstacles.quadratic import obstacle_free
 from dadiff.experts.obstacles.starts import encounters, other_side, subsets
 
-_CHUNK = 2500  # environments solved side by side: fewer waste calls, more leave the cache
-_PENALTY, _PENALTY_GROWTH, _ENOUGH_FALL = 3.0, 10.0, 0.25
-_SETTLED = 1e-10  # Newton decrement, in units of cost, at which multipliers move on
-_FORESEEN = 0.1  # share of L by which Newton's model may still lower it where a start is given up
+_CHUNK = 500  # environments solved side by side: fewer waste calls, more leave the cache and hold the bar up
 _ITERATIONS = 150
-_ARMIJO, _BACKTRACKS = 1e-4, 30
 _AT_MOST, _ROUNDS = 4, 3  # encounters that are flipped in combination; rounds of single flips
 _REACH = 1.0  # metres from a disc within which its other side is tried
 
@@ -116,65 +111,11 @@ def minimise(
     Returns:
         Positions (N, T+1, 2), and (N,) whether the method converged there.
     """
-    result, converged = start.copy(), np.zeros(problem.count, dtype=bool)
-    rows, ceiling = np.arange(problem.count), np.broadcast_to(ceiling, problem.count)
-    L, p = Lagrangian.of(problem, _PENALTY), batch_last(start)
-    violation = np.full(problem.count, np.inf)
-    for _ in range(_ITERATIONS):
-        p, value, decrement = _descend(L, p)
-        hopeless = (decrement <= _FORESEEN * value) & (value - 2 * decrement > ceiling[rows])
-        L, violation, done = _update(L, p, decrement <= _SETTLED, violation)
-        if (leaving := done | hopeless).any():
-            done &= ~hopeless
-            result[rows[done]], converged[rows[done]] = np.moveaxis(p[..., done], -1, 0), True
-            going = np.flatnonzero(~leaving)
-            rows, L, p, violation = rows[going], L.take(going), select(p, going), violation[going]
-        if not len(rows):
-            break
-    result[rows] = np.moveaxis(p, -1, 0)
-    return result, converged
+    from dadiff.experts.obstacles import kernels
 
-
-def _descend(L: Lagrangian, p: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """One damped Newton step: the new p, L there, and half the decrement g' H^-1 g before it, (N,)."""
-    g, offset = L.constraint(p)
-    s = L.force(g)
-    gradient = L.gradient(p, s, offset)
-    step = L.newton_step(gradient, s, offset)
-    decrement = -(gradient * step).sum(axis=(0, 1)) / 2
-    return *_backtrack(L, p, L.value(p, s), step, decrement), decrement
-
-
-def _backtrack(
-    L: Lagrangian, p: np.ndarray, before: np.ndarray, step: np.ndarray, decrement: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """p + a step with the first a = 1, 1/2, ... that decreases L enough (Armijo), and L there; environments apart."""
-    size, slack = 1.0, 1e-12 * (1 + np.abs(before))  # slack for rounding, near convergence
-    trial = p.copy()
-    trial[2:] += step
-    value = L.value(trial)
-    for _ in range(_BACKTRACKS):
-        wrong = np.flatnonzero(value > before - 2 * _ARMIJO * size * decrement + slack)
-        if not len(wrong):
-            break
-        size /= 2
-        shorter = select(p, wrong)
-        shorter[2:] += size * select(step, wrong)
-        trial[..., wrong], value[wrong] = shorter, L.take(wrong).value(shorter)
-    return trial, value
-
-
-def _update(
-    L: Lagrangian, p: np.ndarray, settled: np.ndarray, violation: np.ndarray
-) -> tuple[Lagrangian, np.ndarray, np.ndarray]:
-    """Move multipliers and penalties on where Newton has settled; the new L, violations and who is done."""
-    if not settled.any():
-        return L, violation, settled
-    g, _ = L.constraint(p)
-    s = L.force(g)
-    now = np.abs(np.maximum(g, -L.multiplier / L.penalty)).max(axis=(0, 1), initial=0.0)
-    done = settled & (now <= TOLERANCE / 10)
-    grow = settled & (now > _ENOUGH_FALL * violation)
-    multiplier = np.where(settled, s, L.multiplier)
-    penalty = np.where(grow, _PENALTY_GROWTH * L.penalty, L.penalty)
-    return Lagrangian(L.f, L.centre, L.radius, multiplier, penalty), np.where(settled, now, violation), done
+    positions = start.copy()
+    converged = kernels.minimise(
+        positions, problem.goal, problem.weight, problem.centre, problem.radius, problem.kappa,
+        np.broadcast_to(ceiling, problem.count).astype(float), _ITERATIONS, TOLERANCE / 10,
+    )  # fmt: skip
+    return positions, converged

@@ -62,6 +62,11 @@ class ObstacleProblem:
         return self.weight.shape[1] - 1
 
     @property
+    def kappa(self) -> float:
+        """rho / dt^4, the cost of a squared second difference of positions."""
+        return self.input_cost / self.time_step**4
+
+    @property
     def start(self) -> np.ndarray:
         """p(0), p(1), (N, 2, 2): no input reaches them."""
         position, velocity = self.x_init[:, :2], self.x_init[:, 2:]
