@@ -1,0 +1,298 @@
+"""Tracking by iterated LQR: the trajectory of a (nonlinear) system that is nearest to a reference, for whole batches.
+
+    min  1/2 |tau - tau_ref|^2_{C^-1}    s.t.  x(t+1) = f_t(x(t), u(t)),  x(0) = x_init,  tau[pins] = values
+
+Gauss-Newton sweeps (Li & Todorov 2004; Tassa et al. 2012 without second derivatives of f): linearise along the plan,
+Riccati backwards, roll the *nonlinear* system out under the gains. Every plan after the first sweep is feasible.
+With weights instead of a covariance and a reference at rest this is the optimal controller of a quadratic cost; with
+a plan that a network drew as the reference it is that plan's projection onto the dynamics.
+
+C^-1 = W is block diagonal in time, or C = W^-1 + U U' with few directions U: then tau_ref + U z with |z|^2 paid for z
+is tracked in W instead, and z is found in the same sweep (`dadiff.experts.riccati`), in O(T (n^3 + n^2 k + m k^2)).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+
+from dadiff.errors import ConfigError, ShapeError
+from dadiff.systems.system import System
+from dadiff.trajectory.layout import TrajectoryLayout
+
+_BACKTRACKS = 8
+_DAMPING = 1e-4  # of a plan that no step length improved, in units of its input weight; tenfold at each failure
+_MOST_DAMPING = 1e8
+_FLOOR = 1e-24  # costs below this share of |reference|^2 are rounding
+
+
+@dataclass(frozen=True)
+class Metric:
+    """|delta|^2 = min over z of (delta - U z)' W (delta - U z) + |z|^2, that is delta' (W^-1 + U U')^-1 delta.
+
+    Args:
+        Q: weights of the states, (T+1, n, n), positive semidefinite.
+        R: weights of the inputs, (T, m, m), positive definite.
+        U: directions, (d, k).
+    """
+
+    layout: TrajectoryLayout
+    Q: np.ndarray = field(repr=False)
+    R: np.ndarray = field(repr=False)
+    U: np.ndarray = field(repr=False)
+
+    @classmethod
+    def diagonal(cls, layout: TrajectoryLayout, variances: np.ndarray, U: np.ndarray | None = None) -> Metric:
+        """From C = diag(variances) + U U', (d,) and (d, k).
+
+        Raises:
+            ConfigError: if a variance is not positive.
+        """
+        if not (variances > 0).all():
+            raise ConfigError(
+                f"metric: the variances reach down to {variances.min():g}; a projection onto nonlinear dynamics needs "
+                "positive ones, give the covariance a floor"
+            )
+        Q, R = (np.eye(w.shape[-1]) * w[..., None] for w in layout.split(1 / variances))
+        return cls(layout, Q, R, np.zeros((layout.size, 0)) if U is None else U)
+
+    def times(self, delta: np.ndarray) -> np.ndarray:
+        """W delta, (..., d)."""
+        x, u = self.layout.split(delta)
+        return self.layout.flatten((self.Q @ x[..., None])[..., 0], (self.R @ u[..., None])[..., 0])
+
+    @cached_property
+    def WU(self) -> np.ndarray:
+        """(d, k)."""
+        return self.times(self.U.T).T
+
+    @cached_property
+    def M(self) -> np.ndarray:
+        """I + U' W U, (k, k)."""
+        return np.eye(self.U.shape[1]) + self.U.T @ self.WU
+
+    def squared(self, delta: np.ndarray) -> np.ndarray:
+        """|delta|^2 of (..., d), by Woodbury."""
+        along = delta @ self.WU
+        with np.errstate(over="ignore", invalid="ignore"):
+            return (delta * self.times(delta)).sum(-1) - (
+                along * np.linalg.solve(self.M, along[..., None])[..., 0]
+            ).sum(-1)
+
+
+@dataclass(frozen=True)
+class Tracking:
+    """One problem for each plan.
+
+    Args:
+        system: of `robots` robots.
+        metric: the same for all plans.
+        reference: tau_ref, (*robots, plans, d).
+        x_init: (*robots, plans, n), or None where x(0) is chosen, too.
+        pins: which other entries of tau are held, (p,), and at which values, (*robots, plans, p).
+    """
+
+    system: System
+    metric: Metric
+    reference: np.ndarray = field(repr=False)
+    x_init: np.ndarray | None = field(default=None, repr=False)
+    pins: tuple[np.ndarray, np.ndarray] | None = field(default=None, repr=False)
+
+    def __post_init__(self) -> None:
+        robots, shape = self.system.robots, self.reference.shape
+        if shape != (*robots, *shape[len(robots) : -1], self.layout.size) or len(shape) != len(robots) + 2:
+            raise ShapeError(f"tracking: reference has shape {shape}; expected {(*robots, 'plans', self.layout.size)}")
+
+    @property
+    def layout(self) -> TrajectoryLayout:
+        """Of the plans."""
+        return self.metric.layout
+
+    @cached_property
+    def floor(self) -> np.ndarray:
+        """Costs that are rounding, (*robots, plans)."""
+        return _FLOOR * (1 + np.abs(self.metric.times(self.reference) * self.reference).sum(-1))
+
+    def cost(self, tau: np.ndarray) -> np.ndarray:
+        """|tau - tau_ref|^2, (*robots, plans); inf where tau left float range."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            cost = self.metric.squared(tau - self.reference)
+        return np.where(np.isfinite(cost), cost, np.inf)
+
+    def violation(self, tau: np.ndarray) -> np.ndarray:
+        """sum of |tau[pins] - values|, (*robots, plans)."""
+        if self.pins is None:
+            return np.zeros(tau.shape[:-1])
+        where, values = self.pins
+        return np.abs(tau[..., where] - values).sum(-1)
+
+    def take(self, index: np.ndarray) -> Tracking:
+        """The problems of plans `index`, where there is one system."""
+        pins = self.pins and (self.pins[0], self.pins[1][index])
+        x_init = None if self.x_init is None else self.x_init[index]
+        return replace(self, reference=self.reference[index], x_init=x_init, pins=pins)
+
+
+@dataclass(frozen=True)
+class Step:
+    """A Gauss-Newton step about a plan: u = u_bar + K (x - x_bar) + a k, x(0) = x_bar(0) + a dx(0), 0 < a <= 1.
+
+    Args:
+        K: (*robots, plans, T, m, n), feedforward: (*robots, plans, T, m), start: (*robots, plans, n).
+        multipliers: of the pins, (*robots, plans, p).
+    """
+
+    K: np.ndarray = field(repr=False)
+    feedforward: np.ndarray = field(repr=False)
+    start: np.ndarray = field(repr=False)
+    multipliers: np.ndarray = field(repr=False)
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Plans after some sweeps.
+
+    Args:
+        tau: (*robots, plans, d), feasible.
+        cost: |tau - tau_ref|^2, (*robots, plans).
+        sweeps: until the last change, (*robots, plans).
+        converged: (*robots, plans).
+    """
+
+    tau: np.ndarray = field(repr=False)
+    cost: np.ndarray = field(repr=False)
+    sweeps: np.ndarray = field(repr=False)
+    converged: np.ndarray = field(repr=False)
+
+
+def solve(
+    problem: Tracking, start: np.ndarray | None = None, *, sweeps: int = 100, tolerance: float = 1e-12
+) -> Solution:
+    """Gauss-Newton sweeps until the cost of each plan falls by less than a share, or their number is reached.
+
+    Args:
+        start: feasible plans to start from, (*robots, plans, d); None linearises along the reference itself first.
+        sweeps: at most.
+        tolerance: the share.
+    """
+    tau = problem.reference if start is None else start
+    feasible = start is not None
+    merit = problem.cost(tau) if feasible else np.full(tau.shape[:-1], np.inf)
+    damping, penalty = np.zeros(tau.shape[:-1]), np.zeros(tau.shape[:-1])
+    converged, count = np.zeros(tau.shape[:-1], dtype=bool), np.zeros(tau.shape[:-1], dtype=int)
+    for _ in range(sweeps):
+        step = gauss_newton(problem, tau, damping, feasible=feasible)
+        penalty = np.maximum(penalty, 4 * np.abs(step.multipliers).max(axis=-1, initial=0.0))
+        before = merit + penalty * problem.violation(tau) if feasible else merit
+        tau, after, moved = _backtrack(problem, tau, step, before, penalty)
+        count += ~converged
+        converged |= moved & (before - after <= tolerance * after + problem.floor)
+        damping = np.where(moved, damping / 10 * (damping > _DAMPING), np.maximum(10 * damping, _DAMPING))
+        merit, feasible = problem.cost(tau), True
+        if (converged | (damping > _MOST_DAMPING)).all():
+            break
+    return Solution(tau, problem.cost(tau), count, converged)
+
+
+def gauss_newton(problem: Tracking, tau: np.ndarray, damping: np.ndarray, *, feasible: bool) -> Step:
+    """The step from plans tau (*robots, plans, d), where they need not be feasible yet."""
+    from dadiff.experts import riccati
+
+    layout, metric = problem.layout, problem.metric
+    x, u = layout.split(tau)
+    A, B, c = problem.system.linearise(x[..., :-1, :], u, np.arange(layout.horizon))
+    defect = np.zeros_like(c) if feasible else c + _times(A, x[..., :-1, :]) + _times(B, u) - x[..., 1:, :]
+    Lx, Lu = layout.split(metric.times(tau - problem.reference))
+    columns, M, M0 = _parameters(problem, tau)
+    shared_x, shared_u = (np.moveaxis(part, 0, -1) for part in layout.split(columns.T))
+    initial = np.zeros_like(x[..., 0, :]) if problem.x_init is None else problem.x_init - x[..., 0, :]
+    solved = riccati.solve_all(
+        _flat(A, 3), _flat(B, 3), _flat(defect, 2), metric.Q, metric.R, _flat(Lx, 2), _flat(Lu, 2),
+        np.ascontiguousarray(shared_x), np.ascontiguousarray(shared_u), M, _flat(M0, 1),
+        _flat(initial, 1), problem.x_init is None, _flat(damping * np.trace(metric.R.mean(0)), 0),
+    )  # fmt: skip
+    K, feedforward, dx, z = (value.reshape(*tau.shape[:-1], *value.shape[1:]) for value in solved)
+    return Step(K, feedforward, dx, z[..., metric.U.shape[1] :])
+
+
+def _parameters(problem: Tracking, tau: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Linear terms (d, k + p) of the k coefficients z and the p multipliers, and their quadratic terms M and M0."""
+    metric = problem.metric
+    columns, M, M0 = -metric.WU, metric.M, -(tau - problem.reference) @ metric.WU
+    if problem.pins is None:
+        return columns, M, M0
+    where, values = problem.pins
+    (d, k), p = metric.U.shape, len(where)
+    joint = np.zeros((k + p, k + p))
+    joint[:k, :k] = M
+    return np.hstack([columns, np.eye(d)[:, where]]), joint, np.concatenate([M0, tau[..., where] - values], axis=-1)
+
+
+def _backtrack(
+    problem: Tracking, tau: np.ndarray, step: Step, before: np.ndarray, penalty: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The longest of a = 1, 1/2, ... whose plan is no worse: plans, their merit, and which plans moved."""
+    best, merit = tau, before
+    moved, a = np.zeros(before.shape, dtype=bool), np.ones(before.shape)
+    slack = 1e-13 * np.where(np.isfinite(before), before, 0) + problem.floor
+    for _ in range(_BACKTRACKS):
+        trial = follow(problem, tau, step, a)
+        value = problem.cost(trial) + penalty * problem.violation(trial)
+        better = ~moved & np.isfinite(value) & (value <= before + slack)
+        best, merit = np.where(better[..., None], trial, best), np.where(better, value, merit)
+        moved |= better
+        if moved.all():
+            break
+        a = np.where(moved, a, a / 2)
+    return best, merit, moved
+
+
+def follow(problem: Tracking, tau: np.ndarray, step: Step, a: np.ndarray) -> np.ndarray:
+    """Roll the system out under the gains about tau (*robots, plans, d), with step lengths a (*robots, plans)."""
+    layout, system = problem.layout, problem.system
+    x_bar, u_bar = layout.split(tau)
+    target = u_bar + a[..., None, None] * step.feedforward
+    x, u = np.empty_like(x_bar), np.empty_like(u_bar)
+    free = problem.x_init is None
+    x[..., 0, :] = x_bar[..., 0, :] + a[..., None] * step.start if free else problem.x_init
+    with np.errstate(over="ignore", invalid="ignore"):
+        for t in range(layout.horizon):
+            now = x[..., t, :]
+            u[..., t, :] = target[..., t, :] + _times(step.K[..., t, :, :], now - x_bar[..., t, :])
+            x[..., t + 1, :] = system.step(now, u[..., t, :], t)
+    return layout.flatten(x, u)
+
+
+def costates(problem: Tracking, tau: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The optimality conditions of feasible plans, without pins: costates lambda(1:T) and the gradients in the inputs.
+
+        lambda(T) = q(T),   lambda(t) = q(t) + A' lambda(t+1),   gradient(t) = r(t) + B' lambda(t+1) = 0
+
+    with [q; r] = C^-1 (tau - tau_ref).
+
+    Returns:
+        (*robots, plans, T, n) and (*robots, plans, T, m).
+    """
+    layout, metric = problem.layout, problem.metric
+    x, u = layout.split(tau)
+    A, B, _ = problem.system.linearise(x[..., :-1, :], u, np.arange(layout.horizon))
+    delta = tau - problem.reference
+    z = np.linalg.solve(metric.M, (delta @ metric.WU)[..., None])[..., 0]
+    q, r = layout.split(metric.times(delta) - z @ metric.WU.T)
+    costate = np.empty_like(x[..., 1:, :])
+    costate[..., -1, :] = q[..., -1, :]
+    for t in range(layout.horizon - 1, 0, -1):
+        costate[..., t - 1, :] = q[..., t, :] + _times(A[..., t, :, :].swapaxes(-1, -2), costate[..., t, :])
+    return costate, r + _times(B.swapaxes(-1, -2), costate)
+
+
+def _times(M: np.ndarray, v: np.ndarray) -> np.ndarray:
+    return (M @ v[..., None])[..., 0]
+
+
+def _flat(values: np.ndarray, keep: int) -> np.ndarray:
+    """All plans along one dimension, followed by the last `keep`."""
+    lead, rest = values.shape[: values.ndim - keep], values.shape[values.ndim - keep :]
+    return np.ascontiguousarray(values).reshape(int(np.prod(lead)), *rest)

@@ -1,0 +1,191 @@
+"""Compiled Riccati recursions: many time-varying LQR problems at once, each with parameters to be chosen as well.
+
+One problem, in deviations from a nominal plan, with parameters zeta = (1, z):
+
+    min over dx, du, z   sum_t  1/2 dx' Q dx + 1/2 du' R du + (dx' Lx + du' Lu) zeta  +  1/2 zeta' M zeta
+    subject to           dx(t+1) = A dx(t) + B du(t) + defect(t)
+
+The value function V_t(dx, zeta) = 1/2 dx' P dx + dx' S zeta + 1/2 zeta' H zeta is swept backwards; z is its stationary
+point at t = 0. What z stands for is the caller's choice: coefficients of the directions of a low-rank metric (M > 0),
+or multipliers of pinned entries (M = 0): one column a parameter, and no step more.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+
+@njit(cache=True, error_model="numpy")
+def solve_all(  # type: ignore[no-untyped-def]
+    A, B, defect, Q, R, Lx, Lu, shared_x, shared_u, M, M0, start, free, damping
+):  # fmt: skip
+    """Gains, feedforward and parameters of every problem.
+
+    Args:
+        A: (N, T, n, n), B: (N, T, n, m), defect: (N, T, n).
+        Q: (T+1, n, n), R: (T, m, m), shared.
+        Lx: (N, T+1, n), Lu: (N, T, m), the linear terms of the 1 in zeta.
+        shared_x: (T+1, n, k), shared_u: (T, m, k), those of z; M: (k, k), M0: (N, k), the quadratic terms of z.
+        start: dx(0), (N, n).
+        free: dx(0) is chosen, too.
+        damping: added to the diagonal of B'PB + R, (N,).
+
+    Returns:
+        K (N, T, m, n), feedforward (N, T, m), dx(0) (N, n) and z (N, k).
+    """
+    N, T, n, m = B.shape
+    k = M.shape[0]
+    K, feedforward = np.empty((N, T, m, n)), np.empty((N, T, m))
+    dx, z = start.copy(), np.zeros((N, k))
+    columns = np.empty((T, m, k + 1))
+    P, S, H = np.empty((n, n)), np.empty((n, k + 1)), np.empty((k + 1, k + 1))
+    for i in range(N):
+        _start_from_the_end(Q[T], Lx[i, T], shared_x[T], M, M0[i], P, S, H)
+        for t in range(T - 1, -1, -1):
+            _step_back(
+                A[i, t], B[i, t], defect[i, t], Q[t], R[t], Lx[i, t], Lu[i, t], shared_x[t], shared_u[t], damping[i],
+                P, S, H, K[i, t], columns[t],
+            )  # fmt: skip
+        if free:
+            _choose_start(P, S, H)
+        _choose_parameters(S, H, dx[i], z[i], free)
+        if free:
+            for a in range(n):
+                dx[i, a] = S[a, 0]
+                for c in range(k):
+                    dx[i, a] += S[a, c + 1] * z[i, c]
+        for t in range(T):
+            for a in range(m):
+                feedforward[i, t, a] = columns[t, a, 0]
+                for c in range(k):
+                    feedforward[i, t, a] += columns[t, a, c + 1] * z[i, c]
+    return K, feedforward, dx, z
+
+
+@njit(cache=True, error_model="numpy")
+def _start_from_the_end(Q, Lx, shared, M, M0, P, S, H):  # type: ignore[no-untyped-def]
+    P[:], S[:, 0], S[:, 1:] = Q, Lx, shared
+    H[0, 0], H[0, 1:], H[1:, 0], H[1:, 1:] = 0.0, M0, M0, M
+
+
+@njit(cache=True, error_model="numpy")
+def _step_back(A, B, defect, Q, R, Lx, Lu, shared_x, shared_u, damping, P, S, H, K, columns):  # type: ignore[no-untyped-def]
+    """V_{t+1} to V_t, in place; the gain goes to K (m, n), the feedforward of each parameter to columns (m, k+1)."""
+    _shift(P, S, H, defect)
+    PA, PB = _times(P, A), _times(P, B)
+    Quu, Qux, Qu = _transposed_times(B, PB), _transposed_times(B, PA), _transposed_times(B, S)
+    for a in range(len(Quu)):
+        Quu[a, a] += damping
+    Quu += R
+    Qu[:, 0] += Lu
+    Qu[:, 1:] += shared_u
+    K[:], columns[:] = -Qux, -Qu
+    _cholesky_solve(Quu, K, columns)
+    _add_transposed_times(H, Qu, columns)
+    P[:], S[:] = _transposed_times(A, PA), _transposed_times(A, S)
+    P += Q
+    S[:, 0] += Lx
+    S[:, 1:] += shared_x
+    _add_transposed_times(P, Qux, K)
+    _add_transposed_times(S, Qux, columns)
+    _symmetrise(P)
+
+
+@njit(cache=True, error_model="numpy")
+def _shift(P, S, H, defect):  # type: ignore[no-untyped-def]
+    """V(dx + defect) as a function of dx: S gains P defect in its first column, H the products of defect and S."""
+    n, q = S.shape
+    for a in range(n):
+        if defect[a] != 0.0:
+            for c in range(1, q):
+                H[0, c] += S[a, c] * defect[a]
+                H[c, 0] = H[0, c]
+    for a in range(n):
+        for b in range(n):
+            S[a, 0] += P[a, b] * defect[b]
+
+
+@njit(cache=True, error_model="numpy")
+def _choose_start(P, S, H):  # type: ignore[no-untyped-def]
+    """Minimise over dx(0) = -P^-1 S zeta, which replaces S."""
+    chosen, none = -S, np.zeros((len(P), 0))
+    _cholesky_solve(P.copy(), chosen, none)
+    _add_transposed_times(H, S, chosen)
+    S[:] = chosen
+
+
+@njit(cache=True, error_model="numpy")
+def _choose_parameters(S, H, dx, z, free):  # type: ignore[no-untyped-def]
+    """Stationary z: H_zz z = -(H_z1 + S_z' dx(0))."""
+    k = len(z)
+    if k == 0:
+        return
+    right = np.empty(k)
+    for c in range(k):
+        right[c] = -H[c + 1, 0]
+        if not free:
+            for a in range(len(dx)):
+                right[c] -= S[a, c + 1] * dx[a]
+    z[:] = np.linalg.solve(np.ascontiguousarray(H[1:, 1:]), right)
+
+
+@njit(cache=True, error_model="numpy")
+def _times(X, Y):  # type: ignore[no-untyped-def]
+    Z = np.zeros((X.shape[0], Y.shape[1]))
+    for a in range(X.shape[0]):
+        for b in range(X.shape[1]):
+            for c in range(Y.shape[1]):
+                Z[a, c] += X[a, b] * Y[b, c]
+    return Z
+
+
+@njit(cache=True, error_model="numpy")
+def _transposed_times(X, Y):  # type: ignore[no-untyped-def]
+    Z = np.zeros((X.shape[1], Y.shape[1]))
+    _add_transposed_times(Z, X, Y)
+    return Z
+
+
+@njit(cache=True, error_model="numpy")
+def _add_transposed_times(Z, X, Y):  # type: ignore[no-untyped-def]
+    for b in range(X.shape[0]):
+        for a in range(X.shape[1]):
+            for c in range(Y.shape[1]):
+                Z[a, c] += X[b, a] * Y[b, c]
+
+
+@njit(cache=True, error_model="numpy")
+def _symmetrise(P):  # type: ignore[no-untyped-def]
+    for a in range(len(P)):
+        for b in range(a):
+            P[a, b] = P[b, a] = 0.5 * (P[a, b] + P[b, a])
+
+
+@njit(cache=True, error_model="numpy")
+def _cholesky_solve(M, X, Y):  # type: ignore[no-untyped-def]
+    """X <- M^-1 X and Y <- M^-1 Y in place; M is overwritten by its Cholesky factor. nan where M is not positive."""
+    for a in range(len(M)):
+        for b in range(a + 1):
+            for c in range(b):
+                M[a, b] -= M[a, c] * M[b, c]
+            M[a, b] = np.sqrt(M[a, a]) if a == b else M[a, b] / M[b, b]
+    _substitute(M, X)
+    _substitute(M, Y)
+
+
+@njit(cache=True, error_model="numpy")
+def _substitute(M, X):  # type: ignore[no-untyped-def]
+    m, q = X.shape
+    for a in range(m):
+        for b in range(a):
+            for c in range(q):
+                X[a, c] -= M[a, b] * X[b, c]
+        for c in range(q):
+            X[a, c] /= M[a, a]
+    for a in range(m - 1, -1, -1):
+        for b in range(a + 1, m):
+            for c in range(q):
+                X[a, c] -= M[b, a] * X[b, c]
+        for c in range(q):
+            X[a, c] /= M[a, a]

@@ -1,0 +1,148 @@
+"""Tracking: equal to the dense solution where the system is linear, to IPOPT where not, and optimal by costates."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dadiff.errors import ConfigError
+from dadiff.experts.ilqr import Metric, Tracking, costates, gauss_newton, solve
+from dadiff.systems.nonlinear import Nonlinear
+from dadiff.systems.quadrotors import GRAVITY, PlanarQuadrotor
+from dadiff.trajectory.response import dynamics_matrix
+
+HORIZON = 12
+
+
+def quadrotors(rng, robots=3):
+    a, b, c = rng.uniform(0.5, 1.5, robots), rng.uniform(0.4, 2, robots), rng.uniform(0, 1, robots)
+    return PlanarQuadrotor(thrust_gain=a, torque_gain=b, drag=c)
+
+
+def starts(rng, *lead):
+    return rng.uniform(-1, 1, (*lead, 6)) * [2, 2, 0.5, 1, 1, 1]
+
+
+def metric(layout, rng, directions):
+    return Metric.diagonal(layout, rng.uniform(0.2, 2, layout.size), rng.standard_normal((layout.size, directions)))
+
+
+def references(layout, rng, *lead):
+    """Rough, infeasible plans."""
+    return 0.3 * rng.standard_normal((*lead, layout.size))
+
+
+@pytest.mark.parametrize("directions", [0, 3])
+@pytest.mark.parametrize("pins", [False, True])
+@pytest.mark.parametrize("free", [False, True])
+def test_on_linear_systems_one_sweep_is_the_projection(directions, pins, free, rng):
+    """tau_ref - C G' (G C G')^-1 (G tau_ref - g), with x(0) and pins as rows of G."""
+    n, m, T, plans = 4, 2, 7, 5
+    A, B = np.eye(n) + 0.2 * rng.standard_normal((n, n)), rng.standard_normal((n, m))
+    system = Nonlinear(
+        lambda x, u: x @ A.T + u @ B.T, n, m, jacobian=lambda x, u: (A + 0 * x[..., None], B + 0 * x[..., None])
+    )
+    layout = system.layout(T)
+    weights, reference = metric(layout, rng, directions), references(layout, rng, plans)
+    where, x_init = np.r_[n * T : n * (T + 1)], rng.standard_normal((plans, n))
+    values = rng.standard_normal((plans, n))
+    problem = Tracking(system, weights, reference, None if free else x_init, (where, values) if pins else None)
+    found = solve(problem, sweeps=1).tau
+    rows, right = [dynamics_matrix(A, B, T)], [np.zeros((plans, n * T))]
+    if not free:
+        rows, right = [*rows, np.eye(layout.size)[layout.initial_state]], [*right, x_init]
+    if pins:
+        rows, right = [*rows, np.eye(layout.size)[where]], [*right, values]
+    G, g = np.concatenate(rows), np.concatenate(right, axis=-1)
+    W = np.diag(weights.times(np.ones(layout.size)))
+    C = np.linalg.inv(W) + weights.U @ weights.U.T
+    expected = reference - np.linalg.solve(G @ C @ G.T, (reference @ G.T - g).T).T @ G @ C
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("directions", [0, 3])
+def test_plans_are_feasible_optimal_and_no_worse_than_before(directions, rng):
+    system = quadrotors(rng)
+    layout = system.layout(HORIZON)
+    problem = Tracking(system, metric(layout, rng, directions), references(layout, rng, 3, 6), starts(rng, 3, 6))
+    first = solve(problem, sweeps=1)
+    found = solve(problem, first.tau)
+    assert found.converged.all()
+    assert (found.cost <= first.cost).all()
+    states, inputs = layout.split(found.tau)
+    np.testing.assert_array_equal(system.simulate(problem.x_init, inputs), states)
+    costate, gradient = costates(problem, found.tau)
+    assert np.abs(gradient).max() < 1e-4 * np.abs(costate).max()
+
+
+def test_pinned_ends_are_met(rng):
+    system = quadrotors(rng)
+    layout = system.layout(30)
+    where, values = np.arange(layout.size)[layout.all_states][-6:], np.zeros((3, 4, 6))
+    reference = np.zeros((3, 4, layout.size))
+    problem = Tracking(system, metric(layout, rng, 0), reference, starts(rng, 3, 4), (where, values))
+    found = solve(problem, sweeps=200)
+    assert found.converged.all()
+    np.testing.assert_allclose(layout.states(found.tau)[..., -1, :], 0, atol=1e-6)
+
+
+def test_a_batch_is_its_plans(rng):
+    system = PlanarQuadrotor()
+    layout = system.layout(HORIZON)
+    problem = Tracking(system, metric(layout, rng, 2), references(layout, rng, 5), starts(rng, 5))
+    together = solve(problem, sweeps=3).tau
+    alone = [solve(problem.take(np.array([i])), sweeps=3).tau[0] for i in range(5)]
+    np.testing.assert_allclose(together, alone, atol=1e-12)
+
+
+def test_an_optimum_stays(rng):
+    system = PlanarQuadrotor()
+    layout = system.layout(HORIZON)
+    feasible = layout.flatten(system.simulate(starts(rng, 5), inputs := rng.standard_normal((5, HORIZON, 2))), inputs)
+    problem = Tracking(system, metric(layout, rng, 2), feasible, layout.states(feasible)[:, 0])
+    np.testing.assert_allclose(solve(problem).tau, feasible, atol=1e-12)
+    step = gauss_newton(problem, feasible, np.zeros(5), feasible=True)
+    np.testing.assert_allclose(step.feedforward, 0, atol=1e-12)
+
+
+def test_variances_are_positive(rng):
+    layout = PlanarQuadrotor().layout(2)
+    with pytest.raises(ConfigError, match=r"variances reach down to 0; .* give the covariance a floor"):
+        Metric.diagonal(layout, np.zeros(layout.size))
+
+
+@pytest.mark.parametrize("directions", [0, 3])
+def test_ipopt_finds_the_same_cost(directions, rng):
+    casadi = pytest.importorskip("casadi")
+    system = PlanarQuadrotor(thrust_gain=0.7, torque_gain=1.3, drag=0.4)
+    layout = system.layout(HORIZON)
+    weights = metric(layout, rng, directions)
+    problem = Tracking(system, weights, references(layout, rng, 3), starts(rng, 3))
+    found = solve(problem)
+    C = np.diag(1 / weights.times(np.ones(layout.size))) + weights.U @ weights.U.T
+    for reference, x_init, cost in zip(problem.reference, problem.x_init, found.cost, strict=True):
+        assert cost == pytest.approx(ipopt(casadi, system, layout, np.linalg.inv(C), reference, x_init), rel=1e-6)
+
+
+def ipopt(casadi, robot, layout, W, reference, x_init):
+    """The same problem, written out for IPOPT."""
+    problem, h = casadi.Opti(), robot.time_step
+    x, u = problem.variable(6, layout.horizon + 1), problem.variable(2, layout.horizon)
+
+    def rate(x, u):
+        thrust = GRAVITY + robot.thrust_gain * u[0]
+        forward = -thrust * casadi.sin(x[2]) - robot.drag * x[3]
+        upward = thrust * casadi.cos(x[2]) - GRAVITY - robot.drag * x[4]
+        return casadi.vertcat(x[3], x[4], x[5], forward, upward, robot.torque_gain * u[1])
+
+    for t in range(layout.horizon):
+        k1 = rate(x[:, t], u[:, t])
+        k2 = rate(x[:, t] + h / 2 * k1, u[:, t])
+        k3 = rate(x[:, t] + h / 2 * k2, u[:, t])
+        k4 = rate(x[:, t] + h * k3, u[:, t])
+        problem.subject_to(x[:, t + 1] == x[:, t] + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4))
+    problem.subject_to(x[:, 0] == x_init)
+    delta = casadi.vertcat(casadi.vec(x), casadi.vec(u)) - reference
+    problem.minimize(delta.T @ W @ delta)
+    problem.solver("ipopt", {"print_time": False}, {"print_level": 0, "sb": "yes", "tol": 1e-12})
+    return float(problem.solve().value(delta.T @ W @ delta))
