@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from dadiff.errors import ConfigError
+from dadiff.experts.compiling import compiled
 from dadiff.experts.obstacles import batched, kernels
 from dadiff.experts.obstacles.problem import ObstacleProblem, time_step_of
 from dadiff.experts.obstacles.quadratic import obstacle_free
@@ -142,7 +143,7 @@ def test_a_function_that_finds_no_place_for_its_machine_code_still_runs() -> Non
     """As in a read-only installation without a home: here, because its source lies in no file."""
     names: dict[str, Any] = {}
     exec("def double(x):\n    return 2 * x", names)
-    assert kernels.compiled(names["double"])(3) == 6
+    assert compiled(names["double"])(3) == 6
 
 
 @pytest.fixture(scope="module", params=["default", "uniform", "hard"])

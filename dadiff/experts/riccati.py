@@ -13,13 +13,29 @@ or multipliers of pinned entries (M = 0): one column a parameter, and no step mo
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from dadiff.experts.compiling import compiled
+
+Array = np.ndarray
 
 
-@njit(cache=True, error_model="numpy")
-def solve_all(  # type: ignore[no-untyped-def]
-    A, B, defect, Q, R, Lx, Lu, shared_x, shared_u, M, M0, start, free, damping
-):  # fmt: skip
+@compiled
+def solve_all(
+    A: Array,
+    B: Array,
+    defect: Array,
+    Q: Array,
+    R: Array,
+    Lx: Array,
+    Lu: Array,
+    shared_x: Array,
+    shared_u: Array,
+    M: Array,
+    M0: Array,
+    start: Array,
+    free: bool,
+    damping: Array,
+) -> tuple[Array, Array, Array, Array]:
     """Gains, feedforward and parameters of every problem.
 
     Args:
@@ -63,14 +79,30 @@ def solve_all(  # type: ignore[no-untyped-def]
     return K, feedforward, dx, z
 
 
-@njit(cache=True, error_model="numpy")
-def _start_from_the_end(Q, Lx, shared, M, M0, P, S, H):  # type: ignore[no-untyped-def]
+@compiled
+def _start_from_the_end(Q: Array, Lx: Array, shared: Array, M: Array, M0: Array, P: Array, S: Array, H: Array) -> None:
     P[:], S[:, 0], S[:, 1:] = Q, Lx, shared
     H[0, 0], H[0, 1:], H[1:, 0], H[1:, 1:] = 0.0, M0, M0, M
 
 
-@njit(cache=True, error_model="numpy")
-def _step_back(A, B, defect, Q, R, Lx, Lu, shared_x, shared_u, damping, P, S, H, K, columns):  # type: ignore[no-untyped-def]
+@compiled
+def _step_back(
+    A: Array,
+    B: Array,
+    defect: Array,
+    Q: Array,
+    R: Array,
+    Lx: Array,
+    Lu: Array,
+    shared_x: Array,
+    shared_u: Array,
+    damping: float,
+    P: Array,
+    S: Array,
+    H: Array,
+    K: Array,
+    columns: Array,
+) -> None:
     """V_{t+1} to V_t, in place; the gain goes to K (m, n), the feedforward of each parameter to columns (m, k+1)."""
     _shift(P, S, H, defect)
     PA, PB = _times(P, A), _times(P, B)
@@ -92,8 +124,8 @@ def _step_back(A, B, defect, Q, R, Lx, Lu, shared_x, shared_u, damping, P, S, H,
     _symmetrise(P)
 
 
-@njit(cache=True, error_model="numpy")
-def _shift(P, S, H, defect):  # type: ignore[no-untyped-def]
+@compiled
+def _shift(P: Array, S: Array, H: Array, defect: Array) -> None:
     """V(dx + defect) as a function of dx: S gains P defect in its first column, H the products of defect and S."""
     n, q = S.shape
     for a in range(n):
@@ -106,8 +138,8 @@ def _shift(P, S, H, defect):  # type: ignore[no-untyped-def]
             S[a, 0] += P[a, b] * defect[b]
 
 
-@njit(cache=True, error_model="numpy")
-def _choose_start(P, S, H):  # type: ignore[no-untyped-def]
+@compiled
+def _choose_start(P: Array, S: Array, H: Array) -> None:
     """Minimise over dx(0) = -P^-1 S zeta, which replaces S."""
     chosen, none = -S, np.zeros((len(P), 0))
     _cholesky_solve(P.copy(), chosen, none)
@@ -115,8 +147,8 @@ def _choose_start(P, S, H):  # type: ignore[no-untyped-def]
     S[:] = chosen
 
 
-@njit(cache=True, error_model="numpy")
-def _choose_parameters(S, H, dx, z, free):  # type: ignore[no-untyped-def]
+@compiled
+def _choose_parameters(S: Array, H: Array, dx: Array, z: Array, free: bool) -> None:
     """Stationary z: H_zz z = -(H_z1 + S_z' dx(0))."""
     k = len(z)
     if k == 0:
@@ -130,8 +162,8 @@ def _choose_parameters(S, H, dx, z, free):  # type: ignore[no-untyped-def]
     z[:] = np.linalg.solve(np.ascontiguousarray(H[1:, 1:]), right)
 
 
-@njit(cache=True, error_model="numpy")
-def _times(X, Y):  # type: ignore[no-untyped-def]
+@compiled
+def _times(X: Array, Y: Array) -> Array:
     Z = np.zeros((X.shape[0], Y.shape[1]))
     for a in range(X.shape[0]):
         for b in range(X.shape[1]):
@@ -140,30 +172,30 @@ def _times(X, Y):  # type: ignore[no-untyped-def]
     return Z
 
 
-@njit(cache=True, error_model="numpy")
-def _transposed_times(X, Y):  # type: ignore[no-untyped-def]
+@compiled
+def _transposed_times(X: Array, Y: Array) -> Array:
     Z = np.zeros((X.shape[1], Y.shape[1]))
     _add_transposed_times(Z, X, Y)
     return Z
 
 
-@njit(cache=True, error_model="numpy")
-def _add_transposed_times(Z, X, Y):  # type: ignore[no-untyped-def]
+@compiled
+def _add_transposed_times(Z: Array, X: Array, Y: Array) -> None:
     for b in range(X.shape[0]):
         for a in range(X.shape[1]):
             for c in range(Y.shape[1]):
                 Z[a, c] += X[b, a] * Y[b, c]
 
 
-@njit(cache=True, error_model="numpy")
-def _symmetrise(P):  # type: ignore[no-untyped-def]
+@compiled
+def _symmetrise(P: Array) -> None:
     for a in range(len(P)):
         for b in range(a):
             P[a, b] = P[b, a] = 0.5 * (P[a, b] + P[b, a])
 
 
-@njit(cache=True, error_model="numpy")
-def _cholesky_solve(M, X, Y):  # type: ignore[no-untyped-def]
+@compiled
+def _cholesky_solve(M: Array, X: Array, Y: Array) -> None:
     """X <- M^-1 X and Y <- M^-1 Y in place; M is overwritten by its Cholesky factor. nan where M is not positive."""
     for a in range(len(M)):
         for b in range(a + 1):
@@ -174,8 +206,8 @@ def _cholesky_solve(M, X, Y):  # type: ignore[no-untyped-def]
     _substitute(M, Y)
 
 
-@njit(cache=True, error_model="numpy")
-def _substitute(M, X):  # type: ignore[no-untyped-def]
+@compiled
+def _substitute(M: Array, X: Array) -> None:
     m, q = X.shape
     for a in range(m):
         for b in range(a):

@@ -173,7 +173,7 @@ class Nonlinear(_Given):
 def forward_jacobian(f: Function, x: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """[df/dx, df/du] (..., n, n + m) and f(x, u) (..., n) by torch's forward mode.
 
-    All points at once, n + m directions. Points do not see one another, so that one tangent per direction serves the whole batch.
+    Points do not see one another, so that one tangent for each of n + m directions serves the whole batch.
     """
     import torch
 

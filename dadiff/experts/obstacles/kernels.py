@@ -16,30 +16,16 @@ another. Machine code is kept where numba finds a place to write: beside this fi
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import NamedTuple
 
-import numba
 import numpy as np
 
-Function = TypeVar("Function", bound=Callable[..., Any])
+from dadiff.experts.compiling import compiled
 
 _PENALTY, _PENALTY_GROWTH, _ENOUGH_FALL = 3.0, 10.0, 0.25
 _SETTLED = 1e-10  # Newton decrement, in units of cost, at which multipliers move on
 _FORESEEN = 0.1  # share of L by which Newton's model may still lower it where a start is given up
 _ARMIJO, _BACKTRACKS = 1e-4, 30
-
-logger = logging.getLogger(__name__)
-
-
-def compiled(function: Function) -> Function:
-    """Machine code of a function, made at its first call; kept for later processes where there is a place for it."""
-    try:
-        return cast(Function, numba.njit(cache=True, nogil=True, error_model="numpy")(function))
-    except RuntimeError as error:  # numba's word for: no writable folder
-        logger.info("%s; it is compiled anew in each process, set NUMBA_CACHE_DIR to a folder to avoid that", error)
-        return cast(Function, numba.njit(nogil=True, error_model="numpy")(function))
 
 
 class One(NamedTuple):
