@@ -21,6 +21,7 @@ from dadiff.diffusion.schedule import paper_linear
 from dadiff.projectors import Known
 from dadiff.randomness import torch_generator
 from dadiff.systems import DampedIntegrators
+from dadiff.tasks import LQR
 
 HORIZON, PLANS = 30, 2000
 SCHEDULE = paper_linear()
@@ -39,7 +40,8 @@ class Fleet:
         self.projection = Known("fixed").fit(self.layout, system).projection(None, x_init).map(torch.as_tensor)
         self.setup = time.perf_counter() - begun
         self.environment = torch.as_tensor(rng.uniform(-4, 4, (*self.shape[:2], 8)))
-        self.denoiser = MLP().build(self.layout, 8, SCHEDULE, torch_generator(0, "initialisation"))
+        condition = LQR().condition(system)
+        self.denoiser = MLP().build(self.layout, condition, SCHEDULE, torch_generator(0, "initialisation"))
 
     def sampling(self) -> float:
         """Seconds to draw all plans."""

@@ -32,7 +32,7 @@ def bench_data(count: int = 10_000) -> None:
 def bench_projection(plans: int = PLANS) -> None:
     """The full DDPM chain of the paper's network (untrained, which takes as long), and the projections within it."""
     system = double_integrator()
-    denoiser = EncoderDecoder().build(LQR_LAYOUT, 8, SCHEDULE, torch_generator(0, "bench"))
+    denoiser = EncoderDecoder().build(LQR_LAYOUT, LQR().condition(system), SCHEDULE, torch_generator(0, "bench"))
     projection = Known().fit(LQR_LAYOUT, system).projection().map(torch.as_tensor)
     spent = [0.0]
 

@@ -37,6 +37,7 @@ BATCH = 64
 MATRIX = 2048
 CONF = Path(__file__).parents[1] / "conf"
 LQR_LAYOUT = TrajectoryLayout(state_dim=4, input_dim=2, horizon=30)
+CONDITION = LQR().condition(double_integrator())
 SCHEDULE = paper_linear()
 
 
@@ -55,7 +56,7 @@ def multiply_adds(recipe: EncoderDecoder, layout: TrajectoryLayout) -> int:
 
 def training_step(recipe: Recipe) -> Callable[[], None]:
     generator = torch_generator(0, "bench")
-    denoiser = recipe.build(LQR_LAYOUT, 8, SCHEDULE, generator)
+    denoiser = recipe.build(LQR_LAYOUT, CONDITION, SCHEDULE, generator)
     optimiser = torch.optim.Adam(denoiser.parameters(), fused=True)
     objective = Objective(recipe, SCHEDULE, Training(), "cpu")
     tau0, eps = torch.randn(2, BATCH, LQR_LAYOUT.size, generator=generator)
@@ -108,7 +109,9 @@ def bench_quick(choice: str = "physical") -> None:
     scaled = coordinates.to_scaled(data.trajectories)
     with tempfile.TemporaryDirectory() as folder:
         begun = time.perf_counter()
-        denoiser = train(MLP(), LQR_LAYOUT, SCHEDULE, training, scaled, data.environment, Path(folder), progress=False)
+        denoiser = train(
+            MLP(), LQR_LAYOUT, CONDITION, SCHEDULE, training, scaled, data.environment, Path(folder), progress=False
+        )
         elapsed = time.perf_counter() - begun
     print(
         f"mlp, training=quick, coordinates={choice}, {torch.get_num_threads()} threads: {elapsed:.0f} s (at most 120)"

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from dadiff.store import Cell, Results, Sweep, Sweeps
-from dadiff.tasks.environments import Environments, encode
+from dadiff.tasks.environments import Environments, condition, encode
 
 PER_STEP = ("planned_state_error", "planned_input_error", "rollout_state_error", "gap", "dynamics_residual")
 
@@ -146,8 +146,8 @@ def chain_table(steps: int, *, grows: bool) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def example_arrays(horizon: int, error: float) -> dict[str, np.ndarray]:
-    """Smooth optima in the plane, plans that miss them by `error`, and a chain, in an obstacle environment."""
+def example_arrays(horizon: int, error: float, *, obstacles: bool = False) -> dict[str, np.ndarray]:
+    """Smooth optima in the plane, plans that miss them by `error`, and a chain; E has obstacles if told to."""
     rng, cases, samples = np.random.default_rng(0), 2, 2
     t = np.linspace(0, 1, horizon + 1)
     start, target, bend = (width * rng.uniform(-1, 1, (cases, 1, 2)) for width in (1, 4, 2))
@@ -158,24 +158,27 @@ def example_arrays(horizon: int, error: float) -> dict[str, np.ndarray]:
     noise = rng.standard_normal((4, horizon + 1, 4))
     keep = np.exp(-((steps / 60) ** 2))[:, None, None]
     inputs = np.zeros((cases, samples, horizon, 2))
+    E = _environment(states, horizon)
+    if not obstacles:
+        del E["waypoints"], E["obstacles"]
     return {
         "states": states[:, None] + wander,
         "rollout_states": states[:, None] + 1.5 * wander,
         "inputs": inputs,
         "reference_states": states,
         "reference_inputs": inputs[:, 0],
-        "environment": _environment(states, horizon),
+        **{f"environment_{name}": values for name, values in E.items()},
         "chain_steps": steps[::-1],
         "chain_states": (keep * states[0] + (1 - keep) * noise)[::-1],
         "noised_states": (keep * states[0] + (1 - keep) * noise)[::-1],
     }
 
 
-def _environment(states: np.ndarray, horizon: int) -> np.ndarray:
+def _environment(states: np.ndarray, horizon: int) -> dict[str, np.ndarray]:
     cases, times = len(states), np.array([horizon // 8, horizon - horizon // 6])
     middle = states[:, [horizon // 2, horizon // 3], :2]
     e = Environments(
         states[:, 0], states[:, -1, :2], states[:, times, :2], np.tile(times, (cases, 1)), np.ones((cases, 2), bool),
         middle + np.array([0.9, -0.7]), np.full((cases, 2), 0.5), np.ones((cases, 2), bool),
     )  # fmt: skip
-    return encode(e, horizon)
+    return condition(2, 2).unpack(encode(e, horizon))

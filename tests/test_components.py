@@ -21,7 +21,7 @@ GIVEN = {
 }
 # Where a component stands for what its methods ask of it.
 METHODS = {
-    "task": ("target", "environment_dim", "demonstrations", "cases", "score"),
+    "task": ("target", "condition", "demonstrations", "cases", "score"),
     "dataset": ("train", "test"),
     "recording": ("record",),
     "sampler": ("steps",),

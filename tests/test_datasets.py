@@ -16,6 +16,7 @@ from dadiff.errors import ConfigError, DataError
 from dadiff.projectors import Hankel, Known
 from dadiff.systems import GaussianExcitation, LinearSystem, double_integrator
 from dadiff.tasks import LQR, Demonstrations
+from dadiff.trajectory import Channel, Layout
 from dadiff.trajectory.subspace import largest_angle
 
 SYSTEM, TASK = double_integrator(), LQR(horizon=6)
@@ -26,8 +27,8 @@ def write(folder: Path, name: str, **changes) -> Path:
     rng = np.random.default_rng(len(name))
     made = TASK.demonstrations(SYSTEM, 1, rng)
     states, inputs = SYSTEM.layout(TASK.horizon).split(made.trajectories[0])
-    ends = np.split(made.environment[0], 2)
-    arrays = {"states": states, "inputs": inputs, "initial_state": ends[0], "target_state": ends[1], **changes}
+    E = LQR().condition(SYSTEM).unpack(made.environment[0])
+    arrays = {"states": states, "inputs": inputs, "initial_state": E["x_init"], "target_state": E["target"], **changes}
     folder.mkdir(parents=True, exist_ok=True)
     np.savez(folder / name, **{key: value for key, value in arrays.items() if value is not None})
     return folder / name
@@ -94,7 +95,7 @@ def test_files_become_demonstrations_and_cases_with_their_own_references(folder)
         assert np.array_equal(states, stored["states"])
         assert np.array_equal(inputs, stored["inputs"])
         assert np.array_equal(test.x_init[0], stored["initial_state"])
-        assert np.array_equal(test.environment[0, 4:], stored["target_state"])
+        assert np.array_equal(test.get("target")[0], stored["target_state"])
 
 
 def test_controls_is_another_name_for_inputs_and_other_arrays_are_ignored(folder):
@@ -219,10 +220,10 @@ def test_empty_and_missing_folders_are_named(folder, part):
 
 def test_a_task_with_another_condition_needs_another_data_set(folder):
     class Elsewhere(LQR):
-        def environment_dim(self, system):
-            return 30
+        def condition(self, system):
+            return Layout((Channel("x_init", 4), Channel("goal", 26)))
 
-    with pytest.raises(ConfigError, match=r"E = \[x_init; x_target\] with 8 entries, but the task's E has 30"):
+    with pytest.raises(ConfigError, match=r"E = \[x_init \(4\); target \(4\)\], .* has x_init \(4\), goal \(26\)"):
         NpzTrajectories(str(folder)).train(Elsewhere(horizon=6), SYSTEM)
 
 

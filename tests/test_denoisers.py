@@ -22,11 +22,13 @@ from dadiff.errors import CheckpointError, ConfigError, ShapeError
 from dadiff.experts.lqr import closed_loop_law, optimal_feedback
 from dadiff.randomness import numpy_generator, torch_generator
 from dadiff.systems import LinearSystem, double_integrator
-from dadiff.trajectory import TrajectoryLayout
+from dadiff.trajectory import Channel, Layout, TrajectoryLayout
 from dadiff.trajectory.coordinates import Coordinates, physical
 
 LAYOUT = TrajectoryLayout(state_dim=3, input_dim=2, horizon=5)
 ENVIRONMENT_DIM = 4
+CONDITION = Layout((Channel("x_init", 3), Channel("target", 1)))
+OTHER = Layout((Channel("x_init", 4), Channel("target", 5)))
 SCHEDULES = [paper_linear(), ddpm_linear(), cosine()]
 RECIPES = [EncoderDecoder(channels=16, latent_dim=8), MLP(width=32, blocks=2)]
 
@@ -34,7 +36,7 @@ RECIPES = [EncoderDecoder(channels=16, latent_dim=8), MLP(width=32, blocks=2)]
 def build(
     recipe: Recipe, schedule: Schedule | None = None, seed: int = 0, layout: TrajectoryLayout = LAYOUT
 ) -> NetworkDenoiser:
-    return recipe.build(layout, ENVIRONMENT_DIM, schedule or paper_linear(), torch_generator(seed, "initialisation"))
+    return recipe.build(layout, CONDITION, schedule or paper_linear(), torch_generator(seed, "initialisation"))
 
 
 def draw(*shape: int, seed: int = 0) -> torch.Tensor:
@@ -261,7 +263,7 @@ def test_saved_and_loaded_is_the_same(recipe, tmp_path):
     denoiser = build(recipe)
     denoiser.standardise_by(draw(20, ENVIRONMENT_DIM).numpy())
     save(denoiser, tmp_path / "model.safetensors")
-    loaded = load(tmp_path / "model.safetensors", recipe, LAYOUT, ENVIRONMENT_DIM, paper_linear())
+    loaded = load(tmp_path / "model.safetensors", recipe, LAYOUT, CONDITION, paper_linear())
     tau, E = draw(3, LAYOUT.size), draw(ENVIRONMENT_DIM, seed=1)
     assert torch.equal(denoiser(tau, 9, E), loaded(tau, 9, E))
     assert [path.name for path in tmp_path.iterdir()] == ["model.safetensors"]
@@ -274,23 +276,23 @@ def stored(tmp_path_factory) -> Path:
     return path
 
 
-@pytest.mark.parametrize(("recipe", "layout", "environment_dim", "schedule", "text"), [
-    (RECIPES[1], TrajectoryLayout(3, 2, 6), ENVIRONMENT_DIM, paper_linear(), r"T = 5 \(expected 6\)"),
-    (RECIPES[1], TrajectoryLayout(4, 1, 5), 9, paper_linear(), r"n = 3 \(expected 4\), m = .*1\), c = 4 \(exp.* 9\)"),
-    (RECIPES[1], LAYOUT, ENVIRONMENT_DIM, paper_linear(num_steps=500), r"L = 1000 \(expected 500\)"),
-    (RECIPES[1], LAYOUT, ENVIRONMENT_DIM, cosine(), "beta = "),
-    (MLP(width=16, blocks=2), LAYOUT, ENVIRONMENT_DIM, paper_linear(), r"width = 32 \(expected 16\)"),
-    (RECIPES[0], LAYOUT, ENVIRONMENT_DIM, paper_linear(), r"recipe = MLP \(expected EncoderDecoder\)"),
+@pytest.mark.parametrize(("recipe", "layout", "condition", "schedule", "text"), [
+    (RECIPES[1], TrajectoryLayout(3, 2, 6), CONDITION, paper_linear(), r"T = 5 \(expected 6\)"),
+    (RECIPES[1], TrajectoryLayout(4, 1, 5), OTHER, paper_linear(), r"n = 3 \(expected 4\), m = .*c = 4 \(expected 9\)"),
+    (RECIPES[1], LAYOUT, CONDITION, paper_linear(num_steps=500), r"L = 1000 \(expected 500\)"),
+    (RECIPES[1], LAYOUT, CONDITION, cosine(), "beta = "),
+    (MLP(width=16, blocks=2), LAYOUT, CONDITION, paper_linear(), r"width = 32 \(expected 16\)"),
+    (RECIPES[0], LAYOUT, CONDITION, paper_linear(), r"recipe = MLP \(expected EncoderDecoder\)"),
 ])  # fmt: skip
-def test_a_model_of_other_sizes_is_refused(stored, recipe, layout, environment_dim, schedule, text):
+def test_a_model_of_other_sizes_is_refused(stored, recipe, layout, condition, schedule, text):
     with pytest.raises(CheckpointError, match=text) as caught:
-        load(stored, recipe, layout, environment_dim, schedule)
+        load(stored, recipe, layout, condition, schedule)
     assert "\n" not in str(caught.value)
     assert str(stored) in str(caught.value)
 
 
 def load_small(path: Path) -> NetworkDenoiser:
-    return load(path, RECIPES[1], LAYOUT, ENVIRONMENT_DIM, paper_linear())
+    return load(path, RECIPES[1], LAYOUT, CONDITION, paper_linear())
 
 
 @pytest.mark.parametrize("kept", [0, 4, 100, 0.5, 0.99])

@@ -14,13 +14,14 @@ from dadiff.evaluation import Evaluation, replay, tracking_errors
 from dadiff.evaluation.errors import dynamics_residual
 from dadiff.evaluation.records import Snapshots, headline, long_table, merged, tables
 from dadiff.tasks import Cases, Scores
+from dadiff.trajectory import Channel, Layout
 
 HORIZON, CASES, SAMPLES = 5, 3, 2
 
 
 def some_cases(system) -> Cases:
     tau, x_init = trajectories(system, HORIZON, CASES)
-    return Cases(np.zeros((*tau.shape[:-1], 1)), x_init, tau)
+    return Cases(Layout((Channel("x_init", system.state_dim),)), x_init, tau)
 
 
 def scores_of(system, cases: Cases, planned: np.ndarray) -> Scores:
@@ -76,7 +77,7 @@ def test_a_fleet_is_its_robots_one_by_one(rng):
     planned = rng.standard_normal((3, CASES, SAMPLES, robots.layout(HORIZON).size))
     together = scores_of(robots, cases, planned)
     for k, robot in enumerate(members(robots)):
-        own = Cases(cases.environment[k], cases.x_init[k], cases.reference[k])
+        own = Cases(cases.condition, cases.environment[k], cases.reference[k])
         alone = scores_of(robot, own, planned[k])
         for name, values in {**alone.per_step, **alone.per_plan}.items():
             both = {**together.per_step, **together.per_plan}[name][k]

@@ -33,6 +33,8 @@ from dadiff.systems import (
 from dadiff.systems.families import Ranges
 from dadiff.tasks import LQR, Fleet
 from dadiff.tasks.fleet import robot_table, transitions
+from dadiff.tasks.lqr import ends_layout
+from dadiff.trajectory import Channel, Layout
 
 CONF = Path(__file__).parents[1] / "conf"
 FAMILIES = [DampedIntegrators(), RotatedIntegrators(), LaggedIntegrators()]
@@ -154,13 +156,13 @@ class TestTask:
         task = fleet_for(self.family, condition_on=told)
         robots = task.target(self.family)
         train, test = task.demonstrations(self.family, 3, rng), task.cases(robots, 2, rng)
-        assert train.environment.shape == (18, task.environment_dim(robots))
-        assert test.environment.shape == (5, 2, task.environment_dim(robots))
+        assert train.environment.shape == (18, task.condition(robots).size)
+        assert test.environment.shape == (5, 2, task.condition(robots).size)
 
     def test_the_network_is_told_the_right_robot(self, rng):
         task = fleet_for(self.family, condition_on="robot_parameters")
         robots = task.target(self.family)
-        told = task.cases(robots, 2, rng).environment[:, :, 8:]
+        told = task.cases(robots, 2, rng).get("parameters")
         np.testing.assert_array_equal(told[:, 1], robots.parameter_table)
 
     def test_transitions_determine_the_robot(self):
@@ -177,8 +179,9 @@ class TestTask:
 
 def test_the_recording_denoiser_ignores_the_order_of_transitions():
     layout = DampedIntegrators().inside(1, np.random.default_rng(0)).layout(4)
+    condition = Layout((Channel("x_init", 4), Channel("target", 4), Channel("recording", 10, 0, 2)))
     recipe = RecordingMLP(width=8, blocks=1, context=4)
-    denoiser = recipe.build(layout, 8 + 30, paper_linear(), torch_generator(0, "test"))
+    denoiser = recipe.build(layout, condition, paper_linear(), torch_generator(0, "test"))
     E = torch.randn(5, 38, generator=torch_generator(0, "E"), dtype=torch.float64)
     denoiser.standardise_by(E.numpy())
     swapped = torch.cat([E[:, :8], E[:, 18:28], E[:, 8:18], E[:, 28:]], dim=-1)
@@ -270,7 +273,7 @@ class TestBadInput:
     def test_a_recording_denoiser_without_recordings(self):
         layout = double_integrator().layout(4)
         with pytest.raises(ConfigError, match="condition_on=recording"):
-            RecordingMLP().build(layout, 8, paper_linear(), torch_generator(0, "test"))
+            RecordingMLP().build(layout, ends_layout(double_integrator()), paper_linear(), torch_generator(0, "test"))
 
 
 def test_one_training_serves_all_projectors_and_recording_lengths():
@@ -298,5 +301,5 @@ def test_a_stored_run(tmp_path, told):
     assert stored["states"].shape == (3, 3, 1, 31, 4)
     assert stored["reference_states"].shape == (3, 3, 31, 4)
     assert len(set(stored["robots"])) == 3
-    np.testing.assert_array_equal(stored["environment"][0, 0, :8], stored["environment"][2, 0, :8])
+    np.testing.assert_array_equal(stored["environment_x_init"][0, 0], stored["environment_x_init"][2, 0])
     assert (run.folder / "examples.npz").stat().st_size < 1e6

@@ -34,7 +34,7 @@ def write(folder: Path, environments: Any) -> Path:
 def test_yaml_environments_are_read_and_solved(tmp_path: Path) -> None:
     task = Obstacles()
     E = load_environments(write(tmp_path, [GOOD, BARE]), task)
-    e = decode(E, task.horizon, task.max_waypoints)
+    e = decode(E, task.condition(), task.horizon)
     np.testing.assert_array_equal(e.time, [[7, 30], [0, 0]])
     np.testing.assert_array_equal(e.present, [[True, False, False, False], [False] * 4])
     cases = task.solve(double_integrator(process_noise=0.0), E)

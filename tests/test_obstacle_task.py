@@ -74,7 +74,7 @@ def test_the_late_waypoint_lies_in_the_annulus_and_the_early_one_on_the_drift() 
 def test_sizes_are_settable(settings: dict) -> None:
     task = Obstacles(**settings)
     found = task.demonstrations(SYSTEM, 5, np.random.default_rng(0))
-    assert found.environment.shape == (5, task.environment_dim(SYSTEM))
+    assert found.environment.shape == (5, task.condition(SYSTEM).size)
     assert found.trajectories.shape == (5, SYSTEM.layout(task.horizon).size)
     assert found.notes["unsolved"] == 0
 
@@ -92,7 +92,7 @@ def test_the_condition_holds_the_whole_environment() -> None:
     e, _ = task.distribution_for(0.1).sample(50, np.random.default_rng(3))
     E = encode(e, task.horizon)
     assert E.shape == (50, 30)
-    back = decode(E, task.horizon, 2)
+    back = decode(E, task.condition(), task.horizon)
     for name in ("x_init", "target", "time", "due", "radius", "present"):
         np.testing.assert_array_equal(getattr(back, name), getattr(e, name))
     np.testing.assert_array_equal(back.centre[e.present], e.centre[e.present])

@@ -210,7 +210,7 @@ def test_paths_have_a_panel_a_condition_and_share_a_line_where_they_coincide(tmp
     ):  # fmt: skip
         store.run(level, task="obstacles", projector=projector, sampler__last_step_noise=last_step_noise,
                   enforcement=None if projector == "none" else "normalised", denoiser="mlp",
-                  arrays=example_arrays(40, level))  # fmt: skip
+                  arrays=example_arrays(40, level, obstacles=True))  # fmt: skip
     store.sweep()
     seen = Evidence(read_sweeps(tmp_path, [store.name]))
     drawn = paths.collect(seen, cells={}, sample_of_data=True, by="sampler.last_step_noise")

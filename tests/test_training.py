@@ -20,9 +20,10 @@ from dadiff.denoisers.training import Training
 from dadiff.diffusion.schedule import paper_linear
 from dadiff.errors import CheckpointError, ConfigError, DataError, ShapeError
 from dadiff.randomness import numpy_generator
-from dadiff.trajectory import TrajectoryLayout
+from dadiff.trajectory import Channel, Layout, TrajectoryLayout
 
 LAYOUT = TrajectoryLayout(state_dim=2, input_dim=1, horizon=4)
+CONDITION = Layout((Channel("x_init", 2), Channel("target", 1)))
 SCHEDULE = paper_linear(num_steps=100, slope=0.01)
 RECIPES = [MLP(width=16, blocks=1), EncoderDecoder(channels=8, latent_dim=4)]
 SHORT = Training(steps=24, batch_size=8, learning_rate=1e-2, warmup=3, ema_decay=0.9, checkpoint_every=7)
@@ -45,7 +46,7 @@ def demonstrations(count: int = 60) -> tuple[np.ndarray, np.ndarray]:
 
 def run(folder: Path, recipe: Recipe = RECIPES[0], training: Training = SHORT, **options: object):
     folder.mkdir(exist_ok=True)
-    return train(recipe, LAYOUT, SCHEDULE, training, *demonstrations(), folder, progress=False, **options)
+    return train(recipe, LAYOUT, CONDITION, SCHEDULE, training, *demonstrations(), folder, progress=False, **options)
 
 
 def same_weights(one: Path, other: Path) -> bool:
@@ -150,7 +151,7 @@ def read_curve(folder: Path) -> list[dict[str, str]]:
 def test_what_is_left_in_the_folder(tmp_path):
     denoiser = run(tmp_path / "a")
     assert sorted(path.name for path in (tmp_path / "a").iterdir()) == ["model.safetensors", "training.csv"]
-    loaded = load(tmp_path / "a/model.safetensors", RECIPES[0], LAYOUT, 3, SCHEDULE)
+    loaded = load(tmp_path / "a/model.safetensors", RECIPES[0], LAYOUT, CONDITION, SCHEDULE)
     tau, E = torch.ones(LAYOUT.size, dtype=torch.float64), torch.ones(3, dtype=torch.float64)
     assert torch.equal(loaded(tau, 5, E), denoiser(tau, 5, E))
     rows = read_curve(tmp_path / "a")
@@ -177,7 +178,7 @@ def test_a_checkpoint_of_another_training_is_refused(tmp_path):
         run(tmp_path / "a", training=replace(SHORT, learning_rate=0.02))
     trajectories, E = demonstrations()
     with pytest.raises(CheckpointError, match=r"data = "):
-        train(RECIPES[0], LAYOUT, SCHEDULE, SHORT, trajectories + 1, E, tmp_path / "a", progress=False)
+        train(RECIPES[0], LAYOUT, CONDITION, SCHEDULE, SHORT, trajectories + 1, E, tmp_path / "a", progress=False)
 
 
 def test_a_truncated_checkpoint_is_refused(tmp_path):
@@ -191,7 +192,7 @@ def test_a_truncated_checkpoint_is_refused(tmp_path):
 
 def test_bad_data_is_named(tmp_path):
     trajectories, E = demonstrations()
-    arguments = (RECIPES[0], LAYOUT, SCHEDULE, SHORT)
+    arguments = (RECIPES[0], LAYOUT, CONDITION, SCHEDULE, SHORT)
     with pytest.raises(ShapeError, match="trajectory has 13 entries"):
         train(*arguments, trajectories[:, :-1], E, tmp_path, progress=False)
     with pytest.raises(ShapeError, match=r"environments \(59, 3\)"):

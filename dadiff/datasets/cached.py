@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +14,13 @@ from dadiff.tasks import Cases, Demonstrations
 
 def save_data(folder: Path, draw: Callable[[], Demonstrations | Cases]) -> None:
     """Draw, and write the arrays into `data.npz` and the notes into `notes.json`."""
-    fields = asdict(draw())
-    (folder / "notes.json").write_text(json.dumps(fields.pop("notes"), indent=1) + "\n")
-    np.savez(folder / "data.npz", **fields)
+    data = draw()
+    (folder / "notes.json").write_text(json.dumps(data.notes, indent=1) + "\n")
+    arrays = {name: value for name, value in vars(data).items() if isinstance(value, np.ndarray)}
+    np.savez(folder / "data.npz", **arrays)  # type: ignore[arg-type]
 
 
 def load_data(folder: Path) -> dict[str, Any]:
-    """The fields that `save_data` wrote."""
+    """The fields that `save_data` wrote: all but the layout of E, which is the task's to say."""
     with np.load(folder / "data.npz", allow_pickle=False) as data:
         return {**data, "notes": json.loads((folder / "notes.json").read_text())}

@@ -131,25 +131,29 @@ class NpzTrajectories:
     def test(self, task: Task, system: LinearSystem) -> Cases:
         """The cases of `path`/test."""
         tau, environment = self._read("test", task, system, self.test_size)
-        return Cases(environment, environment[:, : system.state_dim], tau)
+        return Cases(task.condition(system), environment, tau)
 
     def _read(self, part: str, task: Task, system: LinearSystem, count: int | None) -> tuple[np.ndarray, np.ndarray]:
         if not isinstance(system, LinearSystem) or system.robots:
             raise ConfigError("dataset: npz trajectories belong to one system, and here are several robots")
         n, m, T = system.state_dim, system.input_dim, task.horizon
-        if task.environment_dim(system) != 2 * n:
+        condition = task.condition(system)
+        if condition.names != ("x_init", "target") or condition.size != 2 * n:
+            fields = ", ".join(f"{channel.name} ({channel.size})" for channel in condition.channels)
             raise ConfigError(
-                f"dataset: npz files give E = [x_init; x_target] with {2 * n} entries, but the task's E has "
-                f"{task.environment_dim(system)}; use dataset=environments for own environments of this task"
+                f"dataset: npz files give E = [x_init ({n}); target ({n})], but the task's E has {fields}; use "
+                "dataset=environments for own environments of the obstacle task"
             )
         files = list_files(Path(self.path) / part)[:count]
         states = np.stack([read_array(f, ["states"], (T + 1, n)) for f in files])
         inputs = np.stack([read_array(f, INPUT_NAMES, (T, m)) for f in files])
-        ends = [[read_array(f, [name], (n,)) for name in ("initial_state", "target_state")] for f in files]
-        for file, (start, _), first in zip(files, ends, states[:, 0], strict=True):
+        x_init, target = (
+            np.stack([read_array(f, [name], (n,)) for f in files]) for name in ("initial_state", "target_state")
+        )
+        for file, start, first in zip(files, x_init, states[:, 0], strict=True):
             if not np.allclose(start, first, rtol=1e-4, atol=1e-6):
                 raise DataError(f"{file}: initial_state is {start.tolist()}, but states begin at {first.tolist()}")
-        return system.layout(T).flatten(states, inputs), np.array(ends).reshape(len(files), 2 * n)
+        return system.layout(T).flatten(states, inputs), condition.pack(x_init=x_init, target=target)
 
 
 @dataclass(frozen=True)

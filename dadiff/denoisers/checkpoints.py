@@ -19,7 +19,7 @@ from dadiff.denoisers.learned import NetworkDenoiser
 from dadiff.denoisers.recipes import Recipe
 from dadiff.diffusion.schedule import Schedule
 from dadiff.errors import CheckpointError
-from dadiff.trajectory import TrajectoryLayout
+from dadiff.trajectory import Layout, TrajectoryLayout
 
 
 def save(denoiser: NetworkDenoiser, path: Path) -> None:
@@ -28,7 +28,7 @@ def save(denoiser: NetworkDenoiser, path: Path) -> None:
 
 
 def load(
-    path: Path, recipe: Recipe, layout: TrajectoryLayout, environment_dim: int, schedule: Schedule
+    path: Path, recipe: Recipe, layout: TrajectoryLayout, condition: Layout, schedule: Schedule
 ) -> NetworkDenoiser:
     """The stored denoiser.
 
@@ -36,8 +36,8 @@ def load(
         CheckpointError: if the file is missing or damaged, or made by another recipe, for other sizes or
             under another schedule.
     """
-    tensors = read(path, describe(recipe, layout, environment_dim, schedule))
-    denoiser = recipe.build(layout, environment_dim, schedule, torch.Generator())
+    tensors = read(path, describe(recipe, layout, condition, schedule))
+    denoiser = recipe.build(layout, condition, schedule, torch.Generator())
     fill(denoiser.state_dict(), tensors, path)
     return denoiser
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from dadiff.diffusion.schedule import Schedule
 from dadiff.errors import CheckpointError
-from dadiff.trajectory import TrajectoryLayout
+from dadiff.trajectory import Layout, TrajectoryLayout
 
 if TYPE_CHECKING:
     from dadiff.denoisers.recipes import Recipe
@@ -19,14 +19,14 @@ FORMAT = 1
 Description = Mapping[str, int | float | str]
 
 
-def describe(recipe: Recipe, layout: TrajectoryLayout, environment_dim: int, schedule: Schedule) -> Description:
+def describe(recipe: Recipe, layout: TrajectoryLayout, condition: Layout, schedule: Schedule) -> Description:
     """Flat, in the letters of the paper: n, m, T, c, L, a digest of beta, and the recipe with its fields."""
     return {
         "format": FORMAT,
         "n": layout.state_dim,
         "m": layout.input_dim,
         "T": layout.horizon,
-        "c": environment_dim,
+        "c": condition.size,
         "L": schedule.num_steps,
         "beta": hashlib.sha256(schedule.beta.tobytes()).hexdigest()[:16],
         "recipe": type(recipe).__name__,

@@ -18,7 +18,7 @@ from dadiff.denoisers.prediction import prediction
 from dadiff.denoisers.recipes import Recipe
 from dadiff.diffusion.schedule import Schedule
 from dadiff.errors import ShapeError
-from dadiff.trajectory import TrajectoryLayout
+from dadiff.trajectory import Layout, TrajectoryLayout
 
 CHUNK = 1024  # trajectories a network call holds activations for
 
@@ -29,7 +29,7 @@ class NetworkDenoiser(nn.Module):
     Args:
         network: built `on_meta`; its weights are drawn here.
         recipe: says what the network predicts.
-        environment_dim: c.
+        condition: the layout of E.
         generator: the source of the initial weights, on the CPU.
 
     Attributes:
@@ -44,19 +44,19 @@ class NetworkDenoiser(nn.Module):
         network: nn.Module,
         recipe: Recipe,
         layout: TrajectoryLayout,
-        environment_dim: int,
+        condition: Layout,
         schedule: Schedule,
         generator: torch.Generator,
     ) -> None:
         super().__init__()
         table = prediction(recipe.prediction, schedule)
-        self.layout, self.environment_dim = layout, environment_dim
-        self.description = describe(recipe, layout, environment_dim, schedule)
+        self.layout, self.condition = layout, condition
+        self.description = describe(recipe, layout, condition, schedule)
         self.estimate_tau, self.estimate_output = table.estimate_tau, table.estimate_output
         self.network = network.to_empty(device="cpu")
         initialise(self.network, generator)
-        self.register_buffer("environment_mean", torch.zeros(environment_dim))
-        self.register_buffer("environment_scale", torch.ones(environment_dim))
+        self.register_buffer("environment_mean", torch.zeros(condition.size))
+        self.register_buffer("environment_scale", torch.ones(condition.size))
 
     def standardise_by(self, environment: np.ndarray) -> None:
         """Scale E by the mean and deviation of a training set's (N, c); what never varies keeps its unit."""
@@ -80,7 +80,7 @@ class NetworkDenoiser(nn.Module):
             ShapeError: if tau or E has another last dimension than the network was built for.
         """
         self._check(tau, environment)
-        E = environment.expand(*tau.shape[:-1], self.environment_dim).reshape(-1, self.environment_dim)
+        E = environment.expand(*tau.shape[:-1], self.condition.size).reshape(-1, self.condition.size)
         flat = tau.reshape(-1, tau.shape[-1])
         step = torch.full((1,), i, device=tau.device)
         outputs = [
@@ -91,10 +91,10 @@ class NetworkDenoiser(nn.Module):
 
     def _check(self, tau: Tensor, environment: Tensor) -> None:
         self.layout.check(tau)
-        if environment.shape[-1] != self.environment_dim:
+        if environment.shape[-1] != self.condition.size:
             raise ShapeError(
                 f"denoiser: the environment has {environment.shape[-1]} entries; the network was built for "
-                f"{self.environment_dim}; use the task that it was trained on"
+                f"{self.condition.size}; use the task that it was trained on"
             )
 
 

@@ -32,7 +32,7 @@ from dadiff.denoisers.training import Training
 from dadiff.diffusion.schedule import Schedule
 from dadiff.errors import DataError, ShapeError
 from dadiff.randomness import torch_generator
-from dadiff.trajectory import TrajectoryLayout
+from dadiff.trajectory import Layout, TrajectoryLayout
 
 Augment = Callable[[Tensor, torch.Generator], Tensor]
 
@@ -45,6 +45,7 @@ log = logging.getLogger(__name__)
 def train(
     recipe: Recipe,
     layout: TrajectoryLayout,
+    condition: Layout,
     schedule: Schedule,
     training: Training,
     trajectories: np.ndarray,
@@ -61,6 +62,7 @@ def train(
     checkpoint. An interruption (SIGINT) takes effect between two steps, after a checkpoint.
 
     Args:
+        condition: the layout of E.
         trajectories: (N, d), in the sampler's coordinates.
         environment: (N, c), in physical units.
         augment: maps a batch of E (B, c) to an equivalent one, drawing from the given generator.
@@ -69,10 +71,10 @@ def train(
         ShapeError, DataError: if the arrays disagree with the layout or hold values that are not finite.
         CheckpointError: if the folder's checkpoint is damaged or belongs to another training.
     """
-    _check_data(layout, trajectories, environment)
+    _check_data(layout, condition, trajectories, environment)
     objective = Objective(recipe, schedule, training, device)
     data = Data(trajectories, environment, schedule.num_steps, training, device, augment)
-    state = State(_untrained(recipe, layout, schedule, training, environment).to(device), training)
+    state = State(_untrained(recipe, layout, condition, schedule, training, environment).to(device), training)
     checkpoint = folder / "checkpoint.safetensors"
     description = {**state.denoiser.description, **_training_description(training, trajectories, environment)}
     if checkpoint.exists():
@@ -267,10 +269,15 @@ def deferred_interrupt() -> Iterator[list[bool]]:
 
 
 def _untrained(
-    recipe: Recipe, layout: TrajectoryLayout, schedule: Schedule, training: Training, environment: np.ndarray
+    recipe: Recipe,
+    layout: TrajectoryLayout,
+    condition: Layout,
+    schedule: Schedule,
+    training: Training,
+    environment: np.ndarray,
 ) -> NetworkDenoiser:
     generator = torch_generator(training.seed, "initialisation")
-    denoiser = recipe.build(layout, environment.shape[-1], schedule, generator)
+    denoiser = recipe.build(layout, condition, schedule, generator)
     denoiser.standardise_by(environment)
     return denoiser
 
@@ -286,8 +293,9 @@ def _progress_bar(training: Training, state: State, *, shown: bool) -> tqdm:
     return tqdm(total=training.steps, initial=state.step, desc="training", unit="step", disable=not shown)
 
 
-def _check_data(layout: TrajectoryLayout, trajectories: np.ndarray, environment: np.ndarray) -> None:
+def _check_data(layout: TrajectoryLayout, condition: Layout, trajectories: np.ndarray, environment: np.ndarray) -> None:
     layout.check(trajectories)
+    condition.check(environment)
     if trajectories.ndim != 2 or environment.ndim != 2 or len(trajectories) != len(environment):
         raise ShapeError(
             f"training: trajectories have shape {trajectories.shape} and environments {environment.shape}; "

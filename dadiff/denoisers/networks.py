@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from dadiff.trajectory import TrajectoryLayout
+from dadiff.trajectory import Layout, TrajectoryLayout
 
 STEP_FEATURES = 64
 EMBEDDING = 128
@@ -73,25 +73,26 @@ class ResidualNetwork(nn.Module):
 class RecordingNetwork(nn.Module):
     """`ResidualNetwork` that is told of a recording by the mean of its transitions' embeddings (deep sets).
 
-    E = [x_init; x_target; (x(t), u(t), x(t+1) - x(t)) for each t].
+    Of E it reads the channel `recording`, (x(t), u(t), x(t+1) - x(t)) for each t, and all others as they are.
     """
 
-    def __init__(self, layout: TrajectoryLayout, width: int, blocks: int, context: int) -> None:
+    def __init__(self, size: int, condition: Layout, width: int, blocks: int, context: int) -> None:
         super().__init__()
-        self.ends, self.transition = 2 * layout.state_dim, 2 * layout.state_dim + layout.input_dim
-        self.embed = nn.Sequential(nn.Linear(self.transition, EMBEDDING), nn.SiLU(), nn.Linear(EMBEDDING, EMBEDDING))
+        self.condition, recording = condition, condition.channel("recording")
+        self.embed = nn.Sequential(nn.Linear(recording.dim, EMBEDDING), nn.SiLU(), nn.Linear(EMBEDDING, EMBEDDING))
         self.summarise = nn.Sequential(nn.SiLU(), nn.Linear(EMBEDDING, context))
-        self.plan = ResidualNetwork(layout.size, self.ends + context, width, blocks)
+        self.plan = ResidualNetwork(size, condition.size - recording.size + context, width, blocks)
 
     def forward(self, tau: Tensor, step: Tensor, environment: Tensor) -> Tensor:
-        transitions = environment[:, self.ends :].unflatten(-1, (-1, self.transition))
-        context = self.summarise(self.embed(transitions).mean(dim=-2))
-        return self.plan(tau, step, torch.cat([environment[:, : self.ends], context], dim=-1))
+        E = self.condition.unpack(environment)
+        context = self.summarise(self.embed(E.pop("recording")).mean(dim=-2))
+        return self.plan(tau, step, torch.cat([*(part.flatten(1) for part in E.values()), context], dim=-1))
 
     def tied(self, scale: np.ndarray) -> np.ndarray:
         """Numbers an entry of E (c,), made the same for all transitions, which one map embeds: their mean over t."""
-        transitions = scale[self.ends :].reshape(-1, self.transition)
-        return np.concatenate([scale[: self.ends], np.tile(transitions.mean(axis=0), len(transitions))])
+        E = self.condition.unpack(scale)
+        E["recording"] = np.tile(E["recording"].mean(axis=0), (len(E["recording"]), 1))
+        return self.condition.pack(**E)
 
 
 def convolution(channels_in: int, channels_out: int, kernel: int) -> nn.Conv2d:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, ClassVar, Protocol
 from dadiff.denoisers.prediction import PredictionChoice
 from dadiff.diffusion.schedule import Schedule
 from dadiff.errors import ConfigError
-from dadiff.trajectory import TrajectoryLayout
+from dadiff.trajectory import Layout, TrajectoryLayout
 
 if TYPE_CHECKING:
     import torch
@@ -29,9 +29,14 @@ class Recipe(Protocol):
         ...
 
     def build(
-        self, layout: TrajectoryLayout, environment_dim: int, schedule: Schedule, generator: torch.Generator
+        self, layout: TrajectoryLayout, condition: Layout, schedule: Schedule, generator: torch.Generator
     ) -> NetworkDenoiser:
-        """The untrained denoiser; all its weights are drawn from the generator."""
+        """The untrained denoiser; all its weights are drawn from the generator.
+
+        Args:
+            layout: of tau.
+            condition: the layout of E.
+        """
         ...
 
 
@@ -65,15 +70,15 @@ class EncoderDecoder:
             raise ConfigError(f"denoiser encoder_decoder: kernel is {self.kernel}; it must be odd to keep the horizon")
 
     def build(
-        self, layout: TrajectoryLayout, environment_dim: int, schedule: Schedule, generator: torch.Generator
+        self, layout: TrajectoryLayout, condition: Layout, schedule: Schedule, generator: torch.Generator
     ) -> NetworkDenoiser:
         """See `Recipe.build`."""
         from dadiff.denoisers.learned import NetworkDenoiser, on_meta
         from dadiff.denoisers.networks import EncoderDecoderNetwork
 
         with on_meta():
-            network = EncoderDecoderNetwork(layout, environment_dim, self.channels, self.kernel, self.latent_dim)
-        return NetworkDenoiser(network, self, layout, environment_dim, schedule, generator)
+            network = EncoderDecoderNetwork(layout, condition.size, self.channels, self.kernel, self.latent_dim)
+        return NetworkDenoiser(network, self, layout, condition, schedule, generator)
 
 
 @dataclass(frozen=True)
@@ -96,20 +101,20 @@ class MLP:
         _check_positive("mlp", width=self.width, blocks=self.blocks)
 
     def build(
-        self, layout: TrajectoryLayout, environment_dim: int, schedule: Schedule, generator: torch.Generator
+        self, layout: TrajectoryLayout, condition: Layout, schedule: Schedule, generator: torch.Generator
     ) -> NetworkDenoiser:
         """See `Recipe.build`."""
         from dadiff.denoisers.learned import NetworkDenoiser, on_meta
         from dadiff.denoisers.networks import ResidualNetwork
 
         with on_meta():
-            network = ResidualNetwork(layout.size, environment_dim, self.width, self.blocks)
-        return NetworkDenoiser(network, self, layout, environment_dim, schedule, generator)
+            network = ResidualNetwork(layout.size, condition.size, self.width, self.blocks)
+        return NetworkDenoiser(network, self, layout, condition, schedule, generator)
 
 
 @dataclass(frozen=True)
 class RecordingMLP:
-    """`MLP` for E = [x_init; x_target; transitions of a short recording]: learns to identify the robot.
+    """`MLP` for an E that holds a `recording`, the transitions of a short one: learns to identify the robot.
 
     Args:
         width: hidden units.
@@ -129,21 +134,20 @@ class RecordingMLP:
         _check_positive("mlp_recording", width=self.width, blocks=self.blocks, context=self.context)
 
     def build(
-        self, layout: TrajectoryLayout, environment_dim: int, schedule: Schedule, generator: torch.Generator
+        self, layout: TrajectoryLayout, condition: Layout, schedule: Schedule, generator: torch.Generator
     ) -> NetworkDenoiser:
         """See `Recipe.build`."""
         from dadiff.denoisers.learned import NetworkDenoiser, on_meta
         from dadiff.denoisers.networks import RecordingNetwork
 
-        told = environment_dim - 2 * layout.state_dim
-        if told < 1 or told % (2 * layout.state_dim + layout.input_dim):
+        if "recording" not in condition:
             raise ConfigError(
-                f"denoiser mlp_recording: E has {environment_dim} entries and holds no recording; "
+                f"denoiser mlp_recording: E has {', '.join(condition.names)} and holds no recording; "
                 "use task=fleet task.condition_on=recording, or denoiser=mlp"
             )
         with on_meta():
-            network = RecordingNetwork(layout, self.width, self.blocks, self.context)
-        return NetworkDenoiser(network, self, layout, environment_dim, schedule, generator)
+            network = RecordingNetwork(layout.size, condition, self.width, self.blocks, self.context)
+        return NetworkDenoiser(network, self, layout, condition, schedule, generator)
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from dadiff.store import Cache, Results
 from dadiff.systems import LinearSystem
 from dadiff.tasks import Cases, Demonstrations
 from dadiff.trajectory.coordinates import Coordinates, physical, standardised
-from dadiff.trajectory.layout import TrajectoryLayout
+from dadiff.trajectory.layout import Layout, TrajectoryLayout
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,12 @@ class Experiment:
         """What is planned for: from the cache, or made now."""
         draw = self.parts["dataset"].test
         build = partial(save_data, draw=lambda: draw(self.parts["task"], self.target))
-        return Cases(**load_data(self._cached(self.identity.cases, build)))
+        return Cases(self.condition, **load_data(self._cached(self.identity.cases, build)))
+
+    @property
+    def condition(self) -> Layout:
+        """Of E."""
+        return self.parts["task"].condition(self.target)
 
     @cached_property
     def coordinates(self) -> Coordinates:
@@ -100,8 +105,8 @@ class Experiment:
         if artefact is None:
             return recipe.exact(self._law(), self.coordinates, schedule, self.device)
         folder = self._cached(artefact, self._train, resumable=True)
-        environment_dim = self.cases.environment.shape[-1]
-        return load(folder / "model.safetensors", recipe, self.layout, environment_dim, schedule).to(self.device)
+        file = folder / "model.safetensors"
+        return load(file, recipe, self.layout, self.condition, schedule).to(self.device)
 
     def prepare(self) -> None:
         """Build what is shared with other runs."""
@@ -123,6 +128,7 @@ class Experiment:
         train(
             self.parts["denoiser"],
             self.layout,
+            self.condition,
             self.parts["schedule"],
             self.parts["training"],
             self.coordinates.to_scaled(demonstrations.trajectories),

@@ -200,15 +200,14 @@ def examples(experiment: Experiment, plans: Plans) -> dict[str, np.ndarray]:
     """The first cases' plans, for figures, and one plan along the chain beside its noised reference.
 
     states and rollout_states (cases, samples, T+1, n), inputs (cases, samples, T, m), reference_states (cases, T+1, n),
-    reference_inputs (cases, T, m), environment (cases, c). Of a fleet all these have a first dimension of a few robots
-    that differ most, `robots` (k,) says which ones, and their first case is the same.
+    reference_inputs (cases, T, m), and environment_* (cases, ...), the channels of E. Of a fleet all these have a
+    first dimension of a few robots that differ most, `robots` (k,) says which ones, and their first case is the same.
     """
     layout, cases, count = experiment.layout, experiment.cases, experiment.parts["evaluation"].examples
     system, shown = _shown(experiment.target)
     planned = plans.planned[shown][..., :count, :, :]
-    reference, environment, x_init = (
-        values[shown][..., :count, :] for values in (cases.reference, cases.environment, cases.x_init)
-    )
+    reference, environment = (values[shown][..., :count, :] for values in (cases.reference, cases.environment))
+    E = cases.condition.unpack(environment)
     steps, chain = plans.snapshots.stacked()
     states, inputs = layout.split(planned)
     reference_states, reference_inputs = layout.split(reference)
@@ -216,10 +215,10 @@ def examples(experiment: Experiment, plans: Plans) -> dict[str, np.ndarray]:
     return {
         "states": states,
         "inputs": inputs,
-        "rollout_states": layout.states(replay(system, layout, planned, x_init)),
+        "rollout_states": layout.states(replay(system, layout, planned, E["x_init"])),
         "reference_states": reference_states,
         "reference_inputs": reference_inputs,
-        "environment": environment,
+        **{f"environment_{name}": values for name, values in E.items()},
         "chain_steps": steps,
         "chain_states": layout.states(experiment.coordinates.to_physical(chain)),
         "noised_states": layout.states(noised),

@@ -2,7 +2,7 @@
 
     E = [x_init (4), target (2), W waypoint slots (x, y, t/T, mask), O obstacle slots (x, y, r, mask)]
 
-Absent slots are zero. E holds the whole environment, so that `decode` undoes `encode`.
+Absent slots are zero. E holds the whole environment, so that `decode` undoes `encode`. `condition` is its layout.
 """
 
 from __future__ import annotations
@@ -12,10 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from dadiff.errors import DataError, InfeasibleError, ShapeError
-
-FIXED, SLOT = 6, 4
-"""Numbers of E before the slots, and numbers a slot."""
+from dadiff.errors import DataError, InfeasibleError
+from dadiff.trajectory.layout import Array, Channel, Layout
 
 
 @dataclass(frozen=True)
@@ -57,9 +55,17 @@ def join(parts: list[Environments]) -> Environments:
     return Environments(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Environments)))
 
 
-def size(max_waypoints: int, max_obstacles: int) -> int:
-    """c, the length of E."""
-    return FIXED + SLOT * (max_waypoints + max_obstacles)
+def condition(max_waypoints: int, max_obstacles: int) -> Layout:
+    """The layout of E: waypoints (W, 4) and obstacles (O, 4) are slots."""
+    waypoints = Channel("waypoints", 4, 1, max_waypoints, ("x", "y", "t/T", "mask"))
+    obstacles = Channel("obstacles", 4, 1, max_obstacles, ("x", "y", "radius", "mask"))
+    start = Channel("x_init", 4, labels=("x", "y", "vx", "vy"))
+    return Layout((start, Channel("target", 2, labels=("x", "y")), waypoints, obstacles))
+
+
+def present(slots: Array) -> Array:
+    """The first three numbers of the slots (k, 4) that are not empty: (x, y, t/T) or (x, y, radius)."""
+    return slots[slots[:, 3] > 0.5][:, :3]
 
 
 def encode(environments: Environments, horizon: int) -> np.ndarray:
@@ -67,27 +73,22 @@ def encode(environments: Environments, horizon: int) -> np.ndarray:
     e = environments
     waypoints = np.concatenate([e.waypoint, e.time[..., None] / horizon, e.due[..., None]], axis=-1)
     obstacles = np.concatenate([e.centre, e.radius[..., None], e.present[..., None]], axis=-1)
-    slots = np.concatenate([waypoints, obstacles], axis=1).reshape(e.count, -1)
-    return np.concatenate([e.x_init, e.target, slots], axis=-1)
+    layout = condition(e.due.shape[1], e.present.shape[1])
+    return layout.pack(x_init=e.x_init, target=e.target, waypoints=waypoints, obstacles=obstacles)
 
 
-def decode(environment: np.ndarray, horizon: int, max_waypoints: int) -> Environments:
+def decode(environment: np.ndarray, layout: Layout, horizon: int) -> Environments:
     """The environments of E (N, c).
 
     Raises:
-        ShapeError: if c is not the length of a condition vector with `max_waypoints`.
+        ShapeError: if c is not the length of the layout.
     """
-    if environment.ndim != 2 or environment.shape[1] < size(max_waypoints, 0) or (environment.shape[1] - FIXED) % SLOT:
-        raise ShapeError(
-            f"environment has shape {environment.shape}; expected (N, {FIXED} + {SLOT} ({max_waypoints} waypoints + "
-            "obstacles)), from this task's settings"
-        )
-    slots = environment[:, FIXED:].reshape(len(environment), -1, SLOT)
-    waypoints, obstacles = slots[:, :max_waypoints], slots[:, max_waypoints:]
-    time = np.rint(waypoints[..., 2] * horizon)
-    x_init, target = environment[:, :4], environment[:, 4:FIXED]
-    due, present = waypoints[..., 3] > 0.5, obstacles[..., 3] > 0.5
-    return Environments(x_init, target, waypoints[..., :2], time, due, obstacles[..., :2], obstacles[..., 2], present)
+    E = layout.unpack(environment)
+    waypoints, obstacles = E["waypoints"], E["obstacles"]
+    time, due, there = np.rint(waypoints[..., 2] * horizon), waypoints[..., 3] > 0.5, obstacles[..., 3] > 0.5
+    return Environments(
+        E["x_init"], E["target"], waypoints[..., :2], time, due, obstacles[..., :2], obstacles[..., 2], there
+    )
 
 
 def check(environments: Environments, horizon: int, time_step: float, where: str = "") -> None:

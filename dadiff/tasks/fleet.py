@@ -17,8 +17,9 @@ import numpy as np
 from dadiff.errors import ConfigError
 from dadiff.randomness import numpy_generator
 from dadiff.systems import Family, GaussianExcitation, Recording, Robots
-from dadiff.tasks.lqr import LQR
+from dadiff.tasks.lqr import LQR, ends_layout
 from dadiff.tasks.task import Cases, Demonstrations, Scores
+from dadiff.trajectory import Channel, Layout
 from dadiff.trajectory.response import along
 
 SERVED = 1.05
@@ -93,12 +94,13 @@ class Fleet:
         robots = system.robots(np.concatenate([inside, outside]))
         return robots if self.alone is None else robots.take([self.alone])
 
-    def environment_dim(self, system: Robots) -> int:
-        """c."""
-        n, m = system.state_dim, system.input_dim
-        recorded = self.recording_length * (2 * n + m)
-        told = {"nothing": 0, "robot_parameters": len(system.parameters), "recording": recorded}
-        return 2 * n + told[self.condition_on]
+    def condition(self, system: Robots) -> Layout:
+        """E = [x_init; target], and `parameters` (p,) or `recording` (S, 2n + m) where these are told."""
+        parameters = Channel("parameters", len(system.parameters), labels=tuple(system.parameters))
+        transition = 2 * system.state_dim + system.input_dim
+        recording = Channel("recording", transition, 0, self.recording_length - 1)
+        told = {"nothing": (), "robot_parameters": (parameters,), "recording": (recording,)}
+        return Layout((*ends_layout(system).channels, *told[self.condition_on]))
 
     def demonstrations(self, system: Family, count: int, rng: np.random.Generator) -> Demonstrations:
         """`count` noisy runs of its expert for each training robot, each in an environment of its own."""
@@ -115,29 +117,30 @@ class Fleet:
         environment = np.broadcast_to(environment, (*system.robots, *environment.shape))
         reference = along(self.lqr.law(system).mean_map, environment)
         condition = self._condition(environment, system, 1, rng)
-        return Cases(condition, environment[..., : system.state_dim], reference)
+        return Cases(self.condition(system), condition, reference)
 
     def score(self, system: Robots, cases: Cases, planned: np.ndarray, rollout: np.ndarray) -> Scores:
         """The cost after replay, relative to each robot's own optimum.
 
         In the headline, of the robots' mean cost ratios: their median, and the share within 5 % of the optimum.
         """
-        ends = replace(cases, environment=cases.environment[..., : 2 * system.state_dim])
-        scores = self.lqr.score(system, ends, planned, rollout)
+        scores = self.lqr.score(system, cases, planned, rollout)
         ratio = scores.per_plan["cost_ratio"].mean(axis=(-2, -1))
         headline = {"median_cost_ratio": float(np.median(ratio)), "robots_served": float((ratio <= SERVED).mean())}
         return replace(scores, headline=headline, tables={"robots": robot_table(system)})
 
     def _condition(self, environment: np.ndarray, robots: Robots, count: int, rng: np.random.Generator) -> np.ndarray:
         """E with what is told of the robot; `count` recordings a robot, one for each environment or one for all."""
-        if self.condition_on == "nothing":
-            return environment
+        ends, told = ends_layout(robots).unpack(environment), {}
         if self.condition_on == "robot_parameters":
-            told = robots.parameter_table[..., None, :]
-        else:
+            told["parameters"] = robots.parameter_table[..., None, :]
+        elif self.condition_on == "recording":
             excitation = GaussianExcitation(self.recording_length, count=count, seed=int(rng.integers(2**31)))
-            told = transitions(excitation.record(robots))
-        return np.concatenate([environment, np.broadcast_to(told, (*environment.shape[:-1], told.shape[-1]))], axis=-1)
+            told["recording"] = transitions(excitation.record(robots))
+        condition = self.condition(robots)
+        lead = environment.shape[:-1]
+        told = {name: np.broadcast_to(v, (*lead, *condition.channel(name).shape)) for name, v in told.items()}
+        return condition.pack(**ends, **told)
 
 
 def robot_table(robots: Robots) -> dict[str, np.ndarray]:
@@ -151,10 +154,9 @@ def robot_table(robots: Robots) -> dict[str, np.ndarray]:
 
 
 def transitions(recording: Recording) -> np.ndarray:
-    """(x(t), u(t), x(t+1) - x(t)) for t = 0..S-1, flat: (*robots, count, S (2n + m))."""
+    """(x(t), u(t), x(t+1) - x(t)) for t = 0..S-1: (*robots, count, S, 2n + m)."""
     x, u = recording.states, recording.inputs
-    steps = np.concatenate([x[..., :-1, :], u, np.diff(x, axis=-2)], axis=-1)
-    return steps.reshape(*steps.shape[:-2], -1)
+    return np.concatenate([x[..., :-1, :], u, np.diff(x, axis=-2)], axis=-1)
 
 
 def _joined(array: np.ndarray) -> np.ndarray:

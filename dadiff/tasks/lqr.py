@@ -13,7 +13,13 @@ from dadiff.errors import ConfigError
 from dadiff.experts.lqr import AffineFeedback, GaussianLaw, closed_loop_law, optimal_feedback, stationary_feedback
 from dadiff.systems import LinearSystem
 from dadiff.tasks.task import Cases, Demonstrations, Scores
+from dadiff.trajectory import Channel, Layout
 from dadiff.trajectory.response import along
+
+
+def ends_layout(system: LinearSystem) -> Layout:
+    """[x_init; target], each (n,): what the expert needs to know."""
+    return Layout((Channel("x_init", system.state_dim), Channel("target", system.state_dim)))
 
 
 @dataclass(frozen=True)
@@ -68,9 +74,9 @@ class LQR:
         """The system itself."""
         return system
 
-    def environment_dim(self, system: LinearSystem) -> int:
-        """2n."""
-        return 2 * system.state_dim
+    def condition(self, system: LinearSystem) -> Layout:
+        """E = [x_init; target], each (n,)."""
+        return ends_layout(system)
 
     def feedback(self, system: LinearSystem) -> AffineFeedback:
         """The expert's controller.
@@ -107,7 +113,7 @@ class LQR:
             reference = self.realise(system, environment, rng)
         else:
             reference = along(self.law(system).mean_map, environment)
-        return Cases(environment, environment[..., : system.state_dim], reference)
+        return Cases(self.condition(system), environment, reference)
 
     def realise(self, system: LinearSystem, environment: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """One noisy run of the expert for each E (*robots, ..., 2n): tau of shape (*robots, ..., d)."""
@@ -123,8 +129,9 @@ class LQR:
 
     def score(self, system: LinearSystem, cases: Cases, planned: np.ndarray, rollout: np.ndarray) -> Scores:
         """The cost after replay, relative to the noise-free finite-horizon optimum of the case."""
-        target = cases.environment[..., system.state_dim :]
+        target = cases.get("target")
         feedback = optimal_feedback(system, self.Q, self.R(system), self.horizon)
-        optimum = along(closed_loop_law(system, feedback).mean_map, cases.environment)
+        ends = ends_layout(system).pack(x_init=cases.x_init, target=target)
+        optimum = along(closed_loop_law(system, feedback).mean_map, ends)
         ratio = self.cost(system, rollout, target[..., None, :]) / self.cost(system, optimum, target)[..., None]
         return Scores(per_plan={"cost_ratio": ratio})

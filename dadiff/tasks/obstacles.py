@@ -23,6 +23,7 @@ from dadiff.tasks.environments import Environments
 from dadiff.tasks.obstacle_distribution import ANNULUS, ObstacleDistribution
 from dadiff.tasks.obstacle_scores import collision_scores, side_scores, waypoint_scores
 from dadiff.tasks.task import Cases, Demonstrations, Scores
+from dadiff.trajectory import Layout
 
 if TYPE_CHECKING:
     import torch
@@ -97,9 +98,9 @@ class Obstacles:
         """The system itself."""
         return system
 
-    def environment_dim(self, system: LinearSystem) -> int:
-        """c = 6 + 4 (max_waypoints + max_obstacles)."""
-        return env.size(self.max_waypoints, self.max_obstacles)
+    def condition(self, system: LinearSystem | None = None) -> Layout:
+        """E: x_init (4), target (2), and slots of waypoints (W, 4) and obstacles (O, 4)."""
+        return env.condition(self.max_waypoints, self.max_obstacles)
 
     def demonstrations(self, system: LinearSystem, count: int, rng: np.random.Generator) -> Demonstrations:
         """Optima in `count` drawn environments; those that the expert could not solve are left out and counted."""
@@ -139,22 +140,24 @@ class Obstacles:
 
     def decode(self, environment: np.ndarray) -> Environments:
         """The environments of condition vectors (N, c)."""
-        if environment.shape[-1] != env.size(self.max_waypoints, self.max_obstacles):
+        layout = self.condition()
+        if environment.shape[-1] != layout.size:
             raise ShapeError(
                 f"environment has {environment.shape[-1]} numbers; max_waypoints = {self.max_waypoints} and "
-                f"max_obstacles = {self.max_obstacles} make {env.size(self.max_waypoints, self.max_obstacles)}"
+                f"max_obstacles = {self.max_obstacles} make {layout.size}"
             )
-        return env.decode(environment, self.horizon, self.max_waypoints)
+        return env.decode(environment, layout, self.horizon)
 
     def augment(self, environment: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
         """Shuffle the obstacle slots within each row of a training batch (N, c): obstacles are a set."""
         import torch
 
-        first = env.size(self.max_waypoints, 0)
-        slots = environment[:, first:].reshape(len(environment), -1, env.SLOT)
+        layout = self.condition()
+        E = layout.unpack(environment)
+        slots = E["obstacles"]
         keys = torch.rand(slots.shape[:2], generator=generator).to(environment.device)
         order = keys.argsort(dim=1)[..., None].expand_as(slots)
-        return torch.cat([environment[:, :first], slots.gather(1, order).flatten(1)], dim=1)
+        return layout.pack(**E | {"obstacles": slots.gather(1, order)})
 
     def problem(self, environments: Environments, time_step: float, *, margin: float | None = None) -> ObstacleProblem:
         """The optimisation problem of environments, its discs inflated by the margin."""
@@ -214,7 +217,7 @@ class Obstacles:
     ) -> Cases:
         states = system.simulate(environments.x_init, inputs)
         reference = system.layout(self.horizon).flatten(states, inputs)
-        return Cases(env.encode(environments, self.horizon), environments.x_init, reference, notes)
+        return Cases(self.condition(), env.encode(environments, self.horizon), reference, notes)
 
 
 def _notes(problem: ObstacleProblem, found: Solutions) -> dict[str, float]:

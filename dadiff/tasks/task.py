@@ -12,6 +12,7 @@ from typing import Protocol
 import numpy as np
 
 from dadiff.systems import LinearSystem
+from dadiff.trajectory import Layout
 
 
 @dataclass(frozen=True)
@@ -34,16 +35,25 @@ class Cases:
     """Test cases with the reference that plans are held against.
 
     Args:
+        condition: the layout of E, which has a channel `x_init`.
         environment: E, (*robots, cases, c).
-        x_init: (*robots, cases, n).
         reference: the optimum's tau, (*robots, cases, d).
         notes: as for `Demonstrations`.
     """
 
+    condition: Layout
     environment: np.ndarray
-    x_init: np.ndarray
     reference: np.ndarray
     notes: dict[str, float] = field(default_factory=dict)
+
+    def get(self, name: str) -> np.ndarray:
+        """A channel of E by its name, (*robots, cases, ...)."""
+        return self.condition.get(self.environment, name)
+
+    @property
+    def x_init(self) -> np.ndarray:
+        """(*robots, cases, n)."""
+        return self.get("x_init")
 
 
 @dataclass(frozen=True)
@@ -72,8 +82,8 @@ class Task(Protocol):
         """The system, or the robots, that plans are made for. A task of one system returns it."""
         ...
 
-    def environment_dim(self, system: LinearSystem) -> int:
-        """c, the length of the condition vector E."""
+    def condition(self, system: LinearSystem) -> Layout:
+        """The channels of the condition vector E, x_init among them, for what `target` returned."""
         ...
 
     def demonstrations(self, system: LinearSystem, count: int, rng: np.random.Generator) -> Demonstrations:

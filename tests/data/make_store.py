@@ -79,7 +79,7 @@ def obstacles() -> None:
         store.run(level, shape=shape, task="obstacles", projector=projector, denoiser="mlp",
                   enforcement="normalised" if projector != "none" else None,
                   per_plan={"collision_rollout": 0.3 * level, "waypoint_distance_1_rollout": 0.2 * level},
-                  arrays=example_arrays(40, level))  # fmt: skip
+                  arrays=example_arrays(40, level, obstacles=True))  # fmt: skip
     store.sweep()
 
 

@@ -18,7 +18,7 @@ from dadiff.reporting.aggregation import Evidence, Method, varying
 from dadiff.reporting.figures.style import INK, legend_below, letter, look_of, panels
 from dadiff.reporting.labels import axis_value, method_name
 from dadiff.reporting.selection import Selector
-from dadiff.tasks.environments import decode
+from dadiff.tasks.environments import present
 
 PANEL_SIDE = 2.9
 REPLAY = (0, (1, 1))
@@ -134,7 +134,7 @@ def collect(
         apart: a panel a method, with the replay of its inputs, instead of one panel for all.
     """
     methods = evidence.methods(cells)
-    used = [m for m in methods if m.finished and "states" in m.finished[0].examples]
+    used = [m for m in methods if m.finished and "environment_target" in m.finished[0].examples]
     values = list(dict.fromkeys(m.axes.get(by) for m in used)) if by else [None]
     shown, drawn = [name for name in varying(methods) if name != by], []
     rows: list[int] | list[None] = robots or [None]
@@ -199,11 +199,12 @@ def _told_apart(paths: list[Path]) -> list[Path]:
 
 def _scene(method: Method, robot: int | None, case: int) -> tuple[Scene, np.ndarray]:
     optimum = _of(method, "reference_states", robot, case)
-    environment = _of(method, "environment", robot, case)
-    task = method.finished[0].record["config"]["task"]
-    if "max_waypoints" in task:
-        e = decode(environment[None], int(task["horizon"]), int(task["max_waypoints"]))
-        discs = np.column_stack([e.centre[0], e.radius[0]])[e.present[0]]
-        return Scene(e.waypoint[0][e.due[0]], e.target, discs), optimum[:, :2]
-    target = environment[optimum.shape[-1] :][:2]
-    return Scene(np.empty((0, 2)), target[None], np.empty((0, 3))), optimum[:, :2]
+    waypoints, discs = (_slots(method, f"environment_{name}", robot, case) for name in ("waypoints", "obstacles"))
+    target = _of(method, "environment_target", robot, case)
+    return Scene(waypoints[:, :2], target[None, :2], discs), optimum[:, :2]
+
+
+def _slots(method: Method, name: str, robot: int | None, case: int) -> np.ndarray:
+    """The filled slots of a channel of E, (k, 3); none where E has no such channel."""
+    stored = name in method.finished[0].examples
+    return present(_of(method, name, robot, case)) if stored else np.empty((0, 3))
