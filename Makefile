@@ -2,7 +2,6 @@
 PYTHON ?= python3.11
 RUN := .venv/bin
 OUTPUTS ?= outputs
-export GOMP_SPINCOUNT ?= 20000
 export MLFLOW_DISABLE_TELEMETRY := true
 
 .PHONY: help install report test slow lint bench clean

@@ -6,6 +6,8 @@ import os
 import subprocess
 import sys
 
+from dadiff import threads
+
 PARTS = {  # module: threads; the batched solver's many small operations are slower with two
     "bench.sampling": None,
     "bench.training": None,
@@ -16,9 +18,10 @@ PARTS = {  # module: threads; the batched solver's many small operations are slo
 
 def main() -> None:
     """Run each part in a process of its own."""
+    threads.settle()
     for module in sys.argv[1:] or PARTS:
-        threads = PARTS.get(module)
-        environment = os.environ | ({"OMP_NUM_THREADS": str(threads)} if threads else {})
+        count = PARTS.get(module)
+        environment = os.environ | (threads.limits(count) if count else {})
         print(f"--- {module}", flush=True)
         subprocess.run([sys.executable, "-m", module], check=True, env=environment)
 

@@ -18,6 +18,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from omegaconf import DictConfig
 
+from dadiff import threads
 from dadiff.config.composed import plain
 from dadiff.errors import DadiffError
 from dadiff.folders import shipped
@@ -80,7 +81,7 @@ def main() -> None:
     from dadiff.launching import register
 
     os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
-    os.environ.setdefault("GOMP_SPINCOUNT", "20000")  # threads that spin for long slow each other on a busy machine
+    threads.settle()
     register()
     reported(lambda: check_what_is_printed(sys.argv[1:]))
     reported(_application)

@@ -15,9 +15,10 @@ import pytest
 
 from dadiff.errors import ConfigError, DataError
 from dadiff.launching.outcome import why
-from dadiff.launching.process_pool import ProcessPool, cores
+from dadiff.launching.process_pool import ProcessPool
 from dadiff.launching.table import Table, clock, last_line
 from dadiff.launching.work import Work
+from dadiff.threads import cores
 
 
 def write(path: Path, text: str, seconds: float = 0.0) -> None:
@@ -179,9 +180,12 @@ def test_numbers_that_make_no_sense_are_refused(bad):
         ProcessPool(**bad)
 
 
-def test_workers_and_threads_do_not_exceed_the_cores():
-    assert ProcessPool(None, threads=1).workers == cores()
-    assert ProcessPool(None, threads=cores() + 1).workers == 1
+@pytest.mark.parametrize("threads", [1, 2, 10_000])
+@pytest.mark.parametrize("workers", [None, 1, 2])
+def test_workers_and_threads_do_not_exceed_the_cores(workers, threads):
+    crowd = ProcessPool(workers, threads=threads)
+    assert crowd.workers == (workers or max(1, cores() // threads))
+    assert crowd.workers * crowd.threads <= max(cores(), crowd.workers)
 
 
 def test_an_endless_reason_is_cut_and_hangs_nothing(pool, tmp_path):

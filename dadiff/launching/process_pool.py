@@ -18,7 +18,8 @@ from multiprocessing.context import ForkServerProcess
 
 from dadiff.launching.outcome import Outcome
 from dadiff.launching.pool import GRACE_SECONDS, TICK_SECONDS, Pool, check_positive
-from dadiff.launching.work import Observer, Running, Work, environment, perform, thread_limits
+from dadiff.launching.work import Observer, Running, Work, environment, perform
+from dadiff.threads import cores, limits
 
 SERVER = {
     "PYTHONWARNINGS": "ignore:resource_tracker",  # which warns of the locks of every job that was ended
@@ -35,7 +36,7 @@ class Process(Running):
 
 
 class ProcessPool(Pool[Process]):
-    """`workers` processes at a time with `threads` threads each.
+    """`workers` processes at a time with `threads` threads each, or fewer where they would exceed the cores.
 
     Args:
         workers: None for as many as the cores allow.
@@ -50,7 +51,8 @@ class ProcessPool(Pool[Process]):
         self, workers: int | None, threads: int = 1, time_limit: float | None = None, preload: Sequence[str] = ()
     ) -> None:
         check_positive(threads=threads)
-        super().__init__(max(1, cores() // threads) if workers is None else workers, threads, time_limit)
+        threads = min(threads, max(1, cores() // (workers or 1)))
+        super().__init__(cores() // threads if workers is None else workers, threads, time_limit)
         self._context = multiprocessing.get_context("forkserver")
         self._context.set_forkserver_preload(list(preload))
         _start_server(threads)
@@ -68,7 +70,7 @@ class ProcessPool(Pool[Process]):
 
     def _start(self, work: Work) -> Process:
         receive, send = self._context.Pipe(duplex=False)
-        threads = self.threads * self.workers if work.alone else self.threads
+        threads = min(self.threads * self.workers, cores()) if work.alone else self.threads
         process = self._context.Process(target=_main, args=(work, threads, send), name=work.name)
         process.start()
         send.close()
@@ -91,16 +93,11 @@ class ProcessPool(Pool[Process]):
                 entry.process.join()
 
 
-def cores() -> int:
-    """The cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 def _start_server(threads: int) -> None:
     """Start the server that jobs are forked from; it inherits the limits on threads of its environment."""
     from multiprocessing import forkserver
 
-    with environment({**thread_limits(threads), **SERVER}):
+    with environment({**limits(threads), **SERVER}):
         forkserver.ensure_running()
 
 

@@ -13,8 +13,9 @@ from dadiff.launching.launcher import SweepLauncher
 from dadiff.launching.outcome import Outcome
 from dadiff.launching.pool import GRACE_SECONDS, TICK_SECONDS, Pool, check_positive
 from dadiff.launching.sweep import SweepRun
-from dadiff.launching.work import Observer, Queued, Work, environment, perform, thread_limits
+from dadiff.launching.work import Observer, Queued, Work, environment, perform
 from dadiff.store import Lease
+from dadiff.threads import limits
 
 
 @dataclass
@@ -59,7 +60,7 @@ class RayPool(Pool[RayTask]):
             ) from error
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
         try:
-            with environment(thread_limits(threads)):
+            with environment(limits(threads)):
                 ray.init(address or "local", include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
         except ConnectionError as error:
             raise ConfigError(f"hydra.launcher: no Ray cluster answers at address {address}") from error

@@ -14,8 +14,9 @@ from dadiff.errors import ConfigError, MissingExtraError
 from dadiff.launching.launcher import SweepLauncher
 from dadiff.launching.pool import GRACE_SECONDS, Pool
 from dadiff.launching.sweep import SweepRun
-from dadiff.launching.work import Queued, Work, environment, perform, thread_limits
+from dadiff.launching.work import Queued, Work, environment, perform
 from dadiff.store import Lease
+from dadiff.threads import limits
 
 POLL_SECONDS = 1.0  # of files on a shared folder
 ASK_SECONDS = 60.0  # between two questions to Slurm, which alone knows of a job that died without a word
@@ -77,7 +78,7 @@ class SlurmPool(Pool[SlurmJob]):
 
         work.log_file.unlink(missing_ok=True)
         try:
-            with environment(thread_limits(self.threads)):
+            with environment(limits(self.threads)):
                 return SlurmJob(work, self._executor.submit(perform, work, self.threads, self._lease))
         except (FailedJobError, FailedSubmissionError) as error:
             return SlurmJob(work, None, refusal=f"Slurm did not take the job: {' '.join(str(error).split())}")

@@ -19,7 +19,6 @@ from dadiff.launching.outcome import Outcome, why
 from dadiff.store import Lease
 
 LEASE_SECONDS = 5.0  # between two looks at the launcher's lease
-THREAD_LIMITS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 
 
 @dataclass(frozen=True)
@@ -108,11 +107,6 @@ def _die_without(lease: Lease) -> None:
         time.sleep(LEASE_SECONDS)
         looks_in_vain = 0 if lease.is_held() else looks_in_vain + 1
     os.kill(os.getpid(), signal.SIGKILL)
-
-
-def thread_limits(threads: int) -> dict[str, str]:
-    """The environment of processes that shall take so many threads."""
-    return dict.fromkeys(THREAD_LIMITS, str(threads))
 
 
 @contextmanager
