@@ -15,11 +15,13 @@ import hydra
 from hydra import compose, initialize_config_dir
 from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from omegaconf import DictConfig
 
 from dadiff import threads
 from dadiff.config.composed import plain
+from dadiff.config.trust import trust
 from dadiff.errors import DadiffError
 from dadiff.folders import shipped
 
@@ -76,6 +78,17 @@ def check_what_is_printed(arguments: list[str]) -> None:
     assemble(resolved, resolved["choices"])
 
 
+def components_named(arguments: list[str]) -> list[str]:
+    """The packages that the command line itself trusts with `components=[...]`."""
+    overrides = get_args_parser().parse_args(arguments).overrides
+    try:
+        given = OverridesParser.create().parse_overrides([text for text in overrides if "components=" in text])
+    except HydraException:
+        return []  # Hydra will parse it again, and say what is wrong
+    named = [override.value() for override in given if override.key_or_group == "components"]
+    return [str(package) for value in named if isinstance(value, list) for package in value]
+
+
 def main() -> None:
     """Entry point."""
     from dadiff.launching import register
@@ -83,6 +96,7 @@ def main() -> None:
     os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
     threads.settle()
     register()
+    trust(components_named(sys.argv[1:]))
     reported(lambda: check_what_is_printed(sys.argv[1:]))
     reported(_application)
 

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from types import ModuleType
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 import yaml
@@ -137,16 +137,20 @@ class Own:
     """A component of the user's own package."""
 
     strength: float = 1.0
+    needs: ClassVar[str | None] = None
+
+    def fit(self, layout, system=None, recording=None):
+        """Nothing."""
 
 
-def loose(strength=1.0):
+def loose(strength=1.0) -> Own:
     """One whose signature says nothing of types."""
 
 
 @pytest.fixture
 def own_package(monkeypatch):
     module = ModuleType("mine")
-    module.Own, module.loose = Own, loose
+    module.Own, module.loose, module.ClassVar = Own, loose, ClassVar
     for thing in (Own, loose):
         monkeypatch.setattr(thing, "__module__", "mine")
     monkeypatch.setitem(sys.modules, "mine", module)

@@ -1,7 +1,8 @@
 """Components from configuration: a mapping with `_target_` becomes an object, after every key and type is checked.
 
 The target's signature is the schema: a dataclass or an annotated function. A misspelt key or a wrong type is an error
-that names the file and the key. Only targets inside this package are built, unless the user names other packages.
+that names the file and the key. Only components of the node's group are built, from this package and from those that
+the user trusts.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from typing import Any, get_type_hints
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
+from dadiff.config.protocols import check_component
 from dadiff.errors import ConfigError
 
 TARGET = "_target_"
@@ -26,7 +28,7 @@ def build(node: Mapping[str, Any], where: str, trusted: Sequence[str] = ()) -> A
 
     Args:
         node: `_target_` and the target's parameters.
-        where: what to call the node in messages, for example "projector (projector/known.yaml)".
+        where: its group, and what to call it in messages, for example "projector (projector/known.yaml)".
         trusted: packages besides this one whose targets may be built.
 
     Raises:
@@ -52,7 +54,7 @@ def resolve(node: Mapping[str, Any], where: str, trusted: Sequence[str] = ()) ->
     """Import the node's target.
 
     Raises:
-        ConfigError: if it is missing, not trusted, or cannot be found.
+        ConfigError: if it is missing, not trusted, cannot be found, or is no component of the node's group.
     """
     path, roots = node.get(TARGET), {"dadiff", *trusted}
     if not isinstance(path, str) or "." not in path:
@@ -70,6 +72,7 @@ def resolve(node: Mapping[str, Any], where: str, trusted: Sequence[str] = ()) ->
     # What a trusted module has itself imported, such as pathlib.Path, is not the trusted package's.
     if not callable(target) or target.__module__.split(".")[0] not in roots:
         raise ConfigError(f"{where}: {TARGET} {path} is no class or function of {path.split('.')[0]}")
+    check_component(where.split()[0], target, where)
     return target
 
 
@@ -77,7 +80,10 @@ def check(node: Mapping[str, Any], target: Callable[..., Any], where: str) -> di
     """The node's parameters, checked against the target's signature."""
     parameters = inspect.signature(target).parameters
     plain_class = inspect.isclass(target) and not is_dataclass(target)
-    hints = get_type_hints(target.__init__ if plain_class else target)
+    try:
+        hints = get_type_hints(target.__init__ if plain_class else target)
+    except (NameError, TypeError) as error:
+        raise ConfigError(f"{where}: the annotations of {target.__qualname__} cannot be read ({error})") from error
     given = {key: value for key, value in node.items() if key != TARGET}
     for key in given:
         if key not in parameters:

@@ -13,6 +13,17 @@ from dadiff.config.settings import GROUPS
 from dadiff.errors import ConfigError
 
 
+def output_folder(value: Any) -> str:
+    """The setting `output_dir`, which is one folder.
+
+    Raises:
+        ConfigError: if it is nothing, a list or a number.
+    """
+    if not isinstance(value, str) or not value.strip() or "\0" in value:
+        raise ConfigError(f"output_dir is {value!r}; expected the path of one folder, such as output_dir=outputs")
+    return value
+
+
 def plain(config: DictConfig, choices: Mapping[str, str]) -> dict[str, Any]:
     """The resolved configuration without Hydra's own node, with the chosen preset of each group under `choices`.
 
@@ -28,5 +39,5 @@ def plain(config: DictConfig, choices: Mapping[str, str]) -> dict[str, Any]:
         raise ConfigError(f"{error.full_key} is missing; give {error.full_key}=...") from error
     except OmegaConfBaseException as error:
         raise ConfigError(str(error).splitlines()[0]) from error
-    result["output_dir"] = str(Path(str(result["output_dir"])).absolute())
+    result["output_dir"] = str(Path(output_folder(result["output_dir"])).absolute())
     return {**result, "choices": {group: choices[group] for group in GROUPS if group in choices}}

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
 from dadiff.config.build import TARGET, build, check, completed, resolve
+from dadiff.config.trust import check_trusted, trusted
 from dadiff.errors import ConfigError
 
 GROUPS = (
@@ -34,7 +35,7 @@ class Settings:
         coordinates: where diffusion and projection act: `physical` units (the paper), or `standardised` channels.
         device: `auto` takes a GPU if there is one.
         output_dir: where everything is written.
-        components: packages besides dadiff whose classes a configuration may name.
+        components: packages besides dadiff whose classes are named; trusted on the command line only.
         force: run again what is finished.
         dry_run: say what would run, and stop.
         progress: show progress bars.
@@ -67,10 +68,12 @@ def settings_of(config: Mapping[str, Any]) -> Settings:
     """The checked top-level settings.
 
     Raises:
-        ConfigError: on an unknown key, a missing group or a wrong type.
+        ConfigError: on an unknown key, a missing group or a wrong type, or where a file trusts a package.
     """
     top = {key: value for key, value in config.items() if key not in GROUPS}
-    return Settings(**check(top, Settings, "config.yaml"))
+    settings = Settings(**check(top, Settings, "config.yaml"))
+    check_trusted(settings.components)
+    return settings
 
 
 def assemble(config: Mapping[str, Any], choices: Mapping[str, str] | None = None) -> Parts:
@@ -83,18 +86,18 @@ def assemble(config: Mapping[str, Any], choices: Mapping[str, str] | None = None
     settings = settings_of(config)
     nodes = {group: (_node(config, group), where(group, choices)) for group in GROUPS}
     for node, place in nodes.values():
-        check(node, resolve(node, place, settings.components), place)
+        check(node, resolve(node, place, trusted()), place)
     built = {}
     for group in reversed(GROUPS):  # the system last: it loads python-control, and mistakes elsewhere are told before
         node, place = nodes[group]
-        built[group] = build(node, place, settings.components)
+        built[group] = build(node, place, trusted())
     return Parts(settings, built)
 
 
 def complete(config: Mapping[str, Any]) -> dict[str, Any]:
     """The configuration with every default written out."""
     settings = settings_of(config)
-    groups = {group: completed(_node(config, group), group, settings.components) for group in GROUPS}
+    groups = {group: completed(_node(config, group), group, trusted()) for group in GROUPS}
     return {**{f.name: getattr(settings, f.name) for f in fields(settings)}, **groups}
 
 

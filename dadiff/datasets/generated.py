@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 from dadiff.errors import ConfigError
 from dadiff.randomness import numpy_generator
@@ -11,6 +11,22 @@ from dadiff.systems import LinearSystem
 from dadiff.tasks import Cases, Demonstrations, Task
 
 Part = Literal["train", "test"]
+
+
+class Dataset(Protocol):
+    """Where demonstrations and test cases come from."""
+
+    def determined_by(self, part: Part) -> dict[str, Any]:
+        """What a part depends on, for its key: sizes and seeds, or what files hold."""
+        ...
+
+    def train(self, task: Task, system: LinearSystem) -> Demonstrations:
+        """The demonstrations."""
+        ...
+
+    def test(self, task: Task, system: LinearSystem) -> Cases:
+        """The test cases with their references."""
+        ...
 
 
 @dataclass(frozen=True)

@@ -40,6 +40,16 @@ class Recipe(Protocol):
         ...
 
 
+class ExactRecipe(Protocol):
+    """A denoiser that is known and not trained."""
+
+    trainable: ClassVar[bool]
+
+    def exact(self, law: Law, coordinates: Coordinates, schedule: Schedule, device: str = "cpu") -> ExactDenoiser:
+        """The denoiser for the law of the clean trajectories."""
+        ...
+
+
 def _check_positive(component: str, **sizes: int) -> None:
     for name, value in sizes.items():
         if value < 1:

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from dadiff.config.trust import VARIABLE, trusted
 from dadiff.errors import ConfigError, MissingExtraError
 from dadiff.launching.launcher import SweepLauncher
 from dadiff.launching.outcome import Outcome
@@ -61,7 +62,13 @@ class RayPool(Pool[RayTask]):
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
         try:
             with environment(limits(threads)):
-                ray.init(address or "local", include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
+                ray.init(
+                    address or "local",
+                    include_dashboard=False,
+                    log_to_driver=False,
+                    logging_level=logging.ERROR,
+                    runtime_env={"env_vars": {VARIABLE: ",".join(trusted())}},
+                )
         except ConnectionError as error:
             raise ConfigError(f"hydra.launcher: no Ray cluster answers at address {address}") from error
         cores = int(ray.cluster_resources().get("CPU", 1))

@@ -49,7 +49,7 @@ class RaySchema:
 
 
 def register() -> None:
-    """Register launchers and their schemas.
+    """Register launchers and their schemas, and guard what Hydra does on its own.
 
     Hydra takes plugins from its namespace package `hydra_plugins` only. A class that is registered by hand passes
     every other check, so the list of accepted names is widened by this package instead.
@@ -58,6 +58,7 @@ def register() -> None:
     from hydra.core.plugins import Plugins
     from hydra.plugins.plugin import Plugin
 
+    from dadiff.launching.guard import install
     from dadiff.launching.processes import ProcessesLauncher
     from dadiff.launching.ray import RayLauncher
     from dadiff.launching.slurm import SlurmLauncher
@@ -71,6 +72,7 @@ def register() -> None:
     for name, (launcher, schema) in launchers.items():
         Plugins.instance().register(launcher)
         ConfigStore.instance().store(group="hydra/launcher", name=f"{name}_schema", node=schema)
+    install()
 
 
 def _is_plugin(name: str) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 
@@ -37,6 +38,14 @@ class Recording:
     def count(self) -> int:
         """Number of experiments."""
         return self.inputs.shape[-3]
+
+
+class Recorder(Protocol):
+    """Where recordings come from."""
+
+    def record(self, system: LinearSystem) -> Recording:
+        """Γ of the system, or of each of its robots."""
+        ...
 
 
 @dataclass(frozen=True)
