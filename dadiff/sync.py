@@ -10,7 +10,7 @@ from pathlib import Path
 
 from dadiff.errors import DadiffError
 from dadiff.launching.jobs import tracking_of
-from dadiff.store import DONE, Cache, Results, StoredRun
+from dadiff.store import Cache, Results, StoredRun
 from dadiff.tracking import Tracking, is_tracked
 
 
@@ -27,9 +27,9 @@ def sync(output_dir: Path, uri: str | None = None) -> tuple[int, int]:
     """
     before = after = 0
     stores: dict[str, Tracking] = {}
-    runs = [run for run in Results(output_dir) if run.status in DONE and run.record["config"]["tracking"]["enabled"]]
+    runs = [run for run in Results(output_dir) if run.record.is_done and run.record.config["tracking"]["enabled"]]
     for run in runs:
-        tracking = tracking_of(run.record["config"])
+        tracking = tracking_of(run.record.config)
         if uri is not None:
             tracking = replace(tracking, uri=uri, parent=None)
         tracking = replace(stores.setdefault(tracking.uri, tracking), parent=tracking.parent)
@@ -46,7 +46,7 @@ def _upload(output_dir: Path, run: StoredRun, tracking: Tracking) -> None:
     if is_tracked(run.folder, tracking.uri):
         return
     tracking.prepare()
-    denoiser = run.record.get("links", {}).get("denoiser")
+    denoiser = run.record.links.get("denoiser")
     if denoiser and Cache(output_dir).contains("denoiser", denoiser):
         tracking.log_training(Cache(output_dir).folder("denoiser", denoiser))
     tracking.log_run(run)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from dadiff.store import Cell, Results, Sweep, Sweeps
+from dadiff.store import Cell, Provenance, Record, Results, Sweep, Sweeps
 from dadiff.tasks.environments import Environments, condition, encode
 
 PER_STEP = ("planned_state_error", "planned_input_error", "rollout_state_error", "gap", "dynamics_residual")
@@ -72,19 +72,18 @@ class MadeUp:
         Results(self.folder).write(record, tables=tables, arrays=arrays)
         return key
 
-    def _record(self, key, name, status, axes, metrics, notes, reason, step, robots) -> dict[str, Any]:
+    def _record(self, key, name, status, axes, metrics, notes, reason, step, robots) -> Record:
         counts = {"cases": self.sizes[0], "samples": self.sizes[1]}
         links = {"cases": f"data{axes['seed']}", "denoiser": f"net{axes['seed']}"}
         if axes.get("denoiser") == "gaussian":
             del links["denoiser"]
         if "recording.length" in axes:
             links["recording"] = f"recording{axes.get('recording.seed', axes['seed'])}"
-        return {
-            "key": key, "name": name, "status": status, "reason": reason, "diverged_step": step,
-            "config": {"task": {"horizon": self.horizon, **self.task}, "axes": axes}, "axes": axes, "metrics": metrics,
-            "notes": notes, "counts": counts if robots is None else {**counts, "robots": len(robots)},
-            "links": links, "provenance": {"commit": "0123456789abcdef", "device": "cpu", "seconds": 1.0},
-        }  # fmt: skip
+        return Record(
+            key, name, status, reason, step, {"task": {"horizon": self.horizon, **self.task}, "axes": axes}, axes,
+            metrics, notes, counts if robots is None else {**counts, "robots": len(robots)}, links,
+            Provenance(seconds=1.0, device="cpu", commit="0123456789abcdef"),
+        )  # fmt: skip
 
     def sweep(self, *extra: Cell) -> None:
         """Write the sweep's record."""

@@ -78,7 +78,7 @@ def test_a_run_stores_errors_along_time_and_their_means(run):
         )
     assert {"cost_ratio", "initial_state_error", "network_calls", "sampling_seconds"} <= set(stored.metrics)
     assert stored.metrics["network_calls"] == 10
-    assert stored.record["notes"]["schedule"] == {"C1": True, "C2": True, "C3": True}
+    assert stored.record.notes["schedule"] == {"C1": True, "C2": True, "C3": True}
     assert {"config.yaml", "run.json", "per_step.parquet", "per_plan.parquet", "chain.parquet", "examples.npz"} <= {
         file.name for file in stored.folder.iterdir()
     }
@@ -124,16 +124,16 @@ def test_learned_sets_are_measured_against_the_true_one(run):
 def test_a_diverged_run_is_a_result_without_numbers(run):
     stored = run("known", "evaluation.divergence_bound=100.0", "sampler.num_steps=1000", enforcement="literal")
     assert stored.status == "diverged"
-    assert 1 <= stored.record["diverged_step"] <= 1000
+    assert 1 <= stored.record.diverged_step <= 1000
     assert not (stored.folder / "per_step.parquet").exists()
     assert not {"planned_state_error", "cost_ratio", "gap"} & set(stored.metrics)
 
 
 def test_what_is_done_is_read_and_not_done_again(run):
     first = run("known")
-    started = first.record["provenance"]["started"], (first.folder / "run.json").stat().st_mtime_ns
+    started = first.record.provenance.started, (first.folder / "run.json").stat().st_mtime_ns
     again = run("known")
-    assert (again.record["provenance"]["started"], (again.folder / "run.json").stat().st_mtime_ns) == started
+    assert (again.record.provenance.started, (again.folder / "run.json").stat().st_mtime_ns) == started
     assert (run("known", "force=true").folder / "run.json").stat().st_mtime_ns != started[1]
 
 
@@ -149,7 +149,7 @@ def test_a_tiny_training_is_done_once_for_two_projectors(tmp_path):
     assert [
         model.stat().st_mtime_ns for model in (tmp_path / "cache" / "denoiser").glob("*/model.safetensors")
     ] == stamps
-    assert runs[0].record["links"]["denoiser"] == runs[1].record["links"]["denoiser"] == models[0].parent.name
+    assert runs[0].record.links["denoiser"] == runs[1].record.links["denoiser"] == models[0].parent.name
 
 
 # --- refused

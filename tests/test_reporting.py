@@ -110,7 +110,7 @@ def test_what_is_published_is_numbers_configurations_and_drawings(tmp_path):
         if cell.record:
             whole = {**stored["shared"], **stored["cells"][cell.key]}
             assert whole.pop("run")
-            assert whole == configurations.flat(cell.record["config"])
+            assert whole == configurations.flat(cell.config)
 
 
 def test_a_password_in_an_address_is_not_shown():

@@ -12,13 +12,14 @@ import signal
 import time
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
 
 from dadiff.errors import DadiffError, DataError, LockedError, StoreError
-from dadiff.store import Cache, Cell, Results, Sweep, Sweeps, store_id
+from dadiff.store import Cache, Cell, Provenance, Record, Results, Status, Sweep, Sweeps, store_id
 from dadiff.store.cli import main as dadiff_cache
 
 KEY = "0123456789abcdef"
@@ -52,8 +53,8 @@ def run_process(target, *arguments) -> int | None:
     return process.exitcode
 
 
-def record(status: str = "finished", key: str = KEY, **more: object) -> dict[str, object]:
-    return {"key": key, "name": "lqr/known", "status": status, "axes": {"seed": 1}, "metrics": {"gap": 1.5}, **more}
+def record(status: Status = "finished", key: str = KEY, **more: Any) -> Record:
+    return Record(key, "lqr/known", status, **{"axes": {"seed": 1}, "metrics": {"gap": 1.5}, **more})
 
 
 def test_a_failure_is_not_written_over_work_in_progress(tmp_path):
@@ -65,7 +66,7 @@ def test_a_failure_is_not_written_over_work_in_progress(tmp_path):
 
 
 def write_a_failure(root: Path) -> None:
-    Results(root).write_failure(record(), "killed", "SIGKILL")
+    Results(root).write_failure(record("killed", reason="SIGKILL"))
 
 
 def test_eight_processes_on_a_cold_cache_build_once(tmp_path):
@@ -147,12 +148,12 @@ def test_a_run_comes_back_as_it_was_stored(tmp_path):
 
 def test_failures_give_way_to_results_and_not_the_other_way(tmp_path):
     results = Results(tmp_path)
-    results.write_failure(record(), "killed", "SIGKILL")
+    results.write_failure(record("killed", reason="SIGKILL"))
     assert results.status(KEY) == "killed"
     assert not results.is_done(KEY)
     results.write(record())
     assert results.is_done(KEY)
-    results.write_failure(record(), "failed", "later")
+    results.write_failure(record("failed", reason="later"))
     assert results.read(KEY).status == "finished"
     assert [path.name for path in results.root.glob("[!.]*")] == [KEY]
 
@@ -166,6 +167,37 @@ def test_a_newer_format_is_refused(tmp_path):
     path.write_text("{")
     with pytest.raises(DataError, match="damaged"):
         Results(tmp_path).read(KEY)
+
+
+def test_a_record_comes_back_typed_whatever_it_holds(tmp_path):
+    made = Provenance("host", "2024-01-01T00:00:00+00:00", 2.0, "cpu", None, {"dadiff": "0"})
+    whole = record(
+        config={"task": {"cost": [1.0, None]}}, notes={"schedule": {"C1": True}}, counts={"cases": 2},
+        links={"cases": KEY}, provenance=made, diverged_step=3, reason="why",
+    )  # fmt: skip
+    assert Results(tmp_path).write(whole).record == whole
+
+
+@pytest.mark.parametrize(
+    ("harm", "where"),
+    [
+        ({"status": "done"}, "status"),
+        ({"key": None}, "key"),
+        ({"axes": []}, "axes"),
+        ({"links": {"cases": 1}}, "links"),
+    ],
+)
+def test_a_record_with_a_wrong_field_is_one_line_that_names_it(tmp_path, harm, where):
+    path = Results(tmp_path).write(record()).folder / "run.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **harm}))
+    with pytest.raises(DataError, match=rf"^[^\n]*run.json: {where}[^\n]*$"):
+        Results(tmp_path).read(KEY)
+
+
+def test_fields_that_a_newer_version_adds_are_left_aside(tmp_path):
+    path = Results(tmp_path).write(record()).folder / "run.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "later": 1}))
+    assert Results(tmp_path).read(KEY).record == record()
 
 
 def test_claims_end_with_their_process(tmp_path):
@@ -246,7 +278,7 @@ def test_an_unwritable_folder_is_one_clear_line(tmp_path):
 def test_the_cache_tool_lists_verifies_and_prunes(tmp_path, capsys):
     get(tmp_path, tmp_path / "log")
     Cache(tmp_path).get_or_build("denoiser", "f" * 16, {}, partial(build_slowly, tmp_path / "log"))
-    Results(tmp_path).write(record(links={"dataset": KEY, "denoiser": None}))
+    Results(tmp_path).write(record(links={"dataset": KEY}))
     arguments = ["--output-dir", str(tmp_path)]
     assert dadiff_cache(["list", *arguments]) == 0
     listed = capsys.readouterr().out

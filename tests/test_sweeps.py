@@ -96,7 +96,7 @@ def test_what_succeeds_is_stored_and_what_fails_is_recorded_with_its_reason(firs
     assert [cell.status for cell in sweep.cells] == ["finished", "finished", "failed", "refused"]
     assert "damaged.npz: is not a readable .npz file" in sweep.cells[2].reason
     failed = Results(root).read(sweep.cells[2].key)
-    assert (failed.status, failed.record["reason"]) == ("failed", sweep.cells[2].reason)
+    assert (failed.status, failed.record.reason) == ("failed", sweep.cells[2].reason)
     assert [entry.kind for entry in Cache(root).entries()] == ["cases", "demonstrations", "denoiser"]
     assert len(outcomes) == 7
     text = summary(sweep, 0, run.folder)

@@ -18,7 +18,7 @@ import pandas as pd
 import pytest
 
 from dadiff.errors import ConfigError, StoreError
-from dadiff.store import Cache, Cell, Results, Sweep, Sweeps
+from dadiff.store import Cache, Cell, Provenance, Record, Results, Sweep, Sweeps
 from dadiff.tracking import Tracking, is_tracked
 from dadiff.tracking.client import open_client
 
@@ -38,16 +38,16 @@ def tracking(uri, tmp_path, request):
 def store(root: Path, key: str = KEY):
     table = pd.DataFrame({"case": [0, 0, 1, 1], "sample": 0, "t": [0, 1, 0, 1], "gap": [0.0, 2.0, 0.0, 4.0]})
     table["planned_input_error"] = [1.0, np.nan, 3.0, np.nan]
-    record = {
-        "key": key,
-        "name": "lqr/known/seed=1",
-        "status": "finished",
-        "axes": {"projector": "known", "seed": 1},
-        "metrics": {"gap": 1.5, "cost_ratio": float("nan")},
-        "counts": {"cases": 2, "samples": 1},
-        "links": {"dataset": KEY, "denoiser": None},
-        "provenance": {"started": "2024-01-01T00:00:00+00:00", "seconds": 2.0, "versions": {"dadiff": "0"}},
-    }
+    record = Record(
+        key,
+        "lqr/known/seed=1",
+        "finished",
+        axes={"projector": "known", "seed": 1},
+        metrics={"gap": 1.5, "cost_ratio": float("nan")},
+        counts={"cases": 2, "samples": 1},
+        links={"dataset": KEY},
+        provenance=Provenance(started="2024-01-01T00:00:00+00:00", seconds=2.0, versions={"dadiff": "0"}),
+    )
     return Results(root).write(record, config_text="seed: 1\n", tables={"per_step": table})
 
 

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import platform
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 from dadiff.config import build
 from dadiff.errors import DadiffError
 from dadiff.launching.outcome import why
 from dadiff.running.identity import identify
-from dadiff.store import DONE, Cache, Results, StoredRun
+from dadiff.running.provenance import record_of
+from dadiff.store import DONE, Cache, Results, Status, StoredRun
 from dadiff.tracking import Tracking
 
 if TYPE_CHECKING:
@@ -45,18 +45,10 @@ def run(config: Mapping[str, Any]) -> StoredRun:
     return stored
 
 
-def record_end(config: Mapping[str, Any], status: str, reason: str) -> None:
+def record_end(config: Mapping[str, Any], status: Status, reason: str) -> None:
     """Store how a run ended that gave no result of its own, unless a result with its key is already there."""
-    identity = identify(config)
-    record = {
-        "key": identity.key,
-        "name": identity.name,
-        "axes": identity.axes,
-        "config": dict(config),
-        "links": {},
-        "provenance": {"host": platform.node(), "ended": datetime.now(UTC).isoformat(timespec="seconds")},
-    }
-    Results(config["output_dir"]).write_failure(record, status, reason)
+    record = record_of(identify(config), config, status, time.time(), reason=reason)
+    Results(config["output_dir"]).write_failure(record)
 
 
 def train(config: Mapping[str, Any]) -> None:

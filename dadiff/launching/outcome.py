@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from dadiff.errors import DadiffError, ExcitationError, InfeasibleError, NotApplicableError
+from dadiff.store import Status
 
 LONGEST_REASON = 2000
 """Characters; the log has the rest."""
@@ -15,15 +16,15 @@ class Outcome:
     """The end of a job.
 
     Args:
-        status: "finished", "refused", "infeasible", "failed", "killed", "timeout" or "out_of_memory".
+        status: that of its run, if it is one.
     """
 
-    status: str
+    status: Status
     reason: str | None
     seconds: float
 
 
-def why(error: BaseException) -> tuple[str, str]:
+def why(error: BaseException) -> tuple[Status, str]:
     """The status and reason that an exception stands for."""
     reason = " ".join(str(error).split())[:LONGEST_REASON]
     if isinstance(error, KeyboardInterrupt):

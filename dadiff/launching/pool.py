@@ -13,6 +13,7 @@ from typing import Generic, TypeVar
 from dadiff.errors import ConfigError
 from dadiff.launching.outcome import Outcome
 from dadiff.launching.work import Observer, Running, Work
+from dadiff.store import Status
 from dadiff.store.files import make_folder
 
 GRACE_SECONDS = 5.0
@@ -80,7 +81,7 @@ class Pool(ABC, Generic[Entry]):
         """Return when one of them may have ended, but soon."""
 
     @abstractmethod
-    def _end(self, entry: Entry) -> tuple[str, str | None] | None:
+    def _end(self, entry: Entry) -> tuple[Status, str | None] | None:
         """Its status and the reason of a failure; None while it runs."""
 
     @abstractmethod

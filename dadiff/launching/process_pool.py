@@ -19,6 +19,7 @@ from multiprocessing.context import ForkServerProcess
 from dadiff.launching.outcome import Outcome
 from dadiff.launching.pool import GRACE_SECONDS, TICK_SECONDS, Pool, check_positive
 from dadiff.launching.work import Observer, Running, Work, environment, perform
+from dadiff.store import Status
 from dadiff.threads import cores, limits
 
 SERVER = {
@@ -79,7 +80,7 @@ class ProcessPool(Pool[Process]):
     def _pause(self, running: Sequence[Process]) -> None:
         wait([entry.process.sentinel for entry in running], TICK_SECONDS)
 
-    def _end(self, entry: Process) -> tuple[str, str | None] | None:
+    def _end(self, entry: Process) -> tuple[Status, str | None] | None:
         return None if entry.process.exitcode is None else _answer(entry)
 
     def _stop(self, running: Sequence[Process]) -> None:
@@ -101,7 +102,7 @@ def _start_server(threads: int) -> None:
         forkserver.ensure_running()
 
 
-def _answer(entry: Process) -> tuple[str, str | None]:
+def _answer(entry: Process) -> tuple[Status, str | None]:
     """What the job said of its end, or what its exit code says in its place."""
     if entry.answer.poll():
         try:

@@ -15,7 +15,7 @@ from dadiff.launching.outcome import Outcome
 from dadiff.launching.pool import GRACE_SECONDS, TICK_SECONDS, Pool, check_positive
 from dadiff.launching.sweep import SweepRun
 from dadiff.launching.work import Observer, Queued, Work, environment, perform
-from dadiff.store import Lease
+from dadiff.store import Lease, Status
 from dadiff.threads import limits
 
 
@@ -90,7 +90,7 @@ class RayPool(Pool[RayTask]):
     def _pause(self, running: Sequence[RayTask]) -> None:
         self._ray.wait([entry.ref for entry in running], timeout=TICK_SECONDS)
 
-    def _end(self, entry: RayTask) -> tuple[str, str | None] | None:
+    def _end(self, entry: RayTask) -> tuple[Status, str | None] | None:
         exceptions = self._ray.exceptions
         try:
             return self._ray.get(entry.ref, timeout=0)

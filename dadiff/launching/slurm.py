@@ -15,13 +15,13 @@ from dadiff.launching.launcher import SweepLauncher
 from dadiff.launching.pool import GRACE_SECONDS, Pool
 from dadiff.launching.sweep import SweepRun
 from dadiff.launching.work import Queued, Work, environment, perform
-from dadiff.store import Lease
+from dadiff.store import Lease, Status
 from dadiff.threads import limits
 
 POLL_SECONDS = 1.0  # of files on a shared folder
 ASK_SECONDS = 60.0  # between two questions to Slurm, which alone knows of a job that died without a word
 MARGIN_MINUTES = 2  # asked for beyond the time limit, which the launcher watches; Slurm's own is the net below
-DEATHS = {"FAILED": "failed", "TIMEOUT": "timeout", "OUT_OF_MEMORY": "out_of_memory"}
+DEATHS: dict[str, Status] = {"FAILED": "failed", "TIMEOUT": "timeout", "OUT_OF_MEMORY": "out_of_memory"}
 
 
 @dataclass
@@ -90,7 +90,7 @@ class SlurmPool(Pool[SlurmJob]):
             for entry in [entry for entry in running if entry.refusal is None][:1]:
                 entry.job.done(force_check=True)  # one question brings the states of all jobs
 
-    def _end(self, entry: SlurmJob) -> tuple[str, str | None] | None:
+    def _end(self, entry: SlurmJob) -> tuple[Status, str | None] | None:
         from submitit.core.utils import UncompletedJobError
 
         if entry.refusal is not None:

@@ -128,7 +128,7 @@ class SweepRun:
         if not (results.is_done(identity.key) and (outcome is not None or planned.is_done)):
             return Cell(identity.key, identity.name, identity.axes, unknown)
         stored = results.read(identity.key)
-        return Cell(identity.key, identity.name, identity.axes, stored.status, stored.record.get("reason"))
+        return Cell(identity.key, identity.name, identity.axes, stored.status, stored.record.reason)
 
     def _preparation(self, preparation: Preparation, parent: str | None) -> Work:
         artefact = preparation.artefact

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from dadiff.launching.outcome import Outcome, why
-from dadiff.store import Lease
+from dadiff.store import Lease, Status
 
 LEASE_SECONDS = 5.0  # between two looks at the launcher's lease
 
@@ -80,7 +80,7 @@ class Observer(Protocol):
         ...
 
 
-def perform(work: Work, threads: int, lease: Lease | None = None) -> tuple[str, str | None]:
+def perform(work: Work, threads: int, lease: Lease | None = None) -> tuple[Status, str | None]:
     """Do the work, in a process of its own. Returns its status, and the reason if it failed.
 
     Args:

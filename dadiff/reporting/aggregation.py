@@ -73,9 +73,9 @@ class Method:
     def counts(self) -> dict[str, int]:
         """Numbers of seeds, recordings, robots, cases and samples behind the method's numbers."""
         seeds = {cell.axes.get("seed") for cell in self.finished}
-        recordings = {cell.record["links"].get("recording") for cell in self.finished} - {None}
-        trained = any(cell.record["links"].get("denoiser") for cell in self.finished)
-        stored = self.finished[0].record["counts"] if self.finished else {}
+        recordings = {cell.link("recording") for cell in self.finished} - {None}
+        trained = any(cell.link("denoiser") for cell in self.finished)
+        stored = self.finished[0].counts if self.finished else {}
         counts = {"training seeds" if trained else "seeds": len(seeds), "recordings": len(recordings), **stored}
         return {name: int(count) for name, count in counts.items() if count}
 
@@ -136,7 +136,7 @@ def pair(method: Method, other: Method) -> tuple[list[Cell], list[Cell]]:
     """
     pairs = _pairs(method, other)
     for a, b in pairs:
-        if a.record["links"].get("cases") != b.record["links"].get("cases"):
+        if a.link("cases") != b.link("cases"):
             raise StoreError(f"runs {a.key} and {b.key}: their data sets differ, so their cases cannot be paired")
     return [a for a, _ in pairs], [b for _, b in pairs]
 

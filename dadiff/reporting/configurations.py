@@ -15,7 +15,7 @@ PLACES = ("output_dir", "tracking", "force", "dry_run", "progress")
 
 def to_yaml(sweep: Sweep) -> str:
     """`shared` and `cells` as yaml, parameters under dotted names; cells that stored nothing are left out."""
-    configs = {cell.key: flat(cell.record["config"]) for cell in sweep.cells if "config" in cell.record}
+    configs = {cell.key: flat(cell.record.config) for cell in sweep.cells if cell.record}
     first = next(iter(configs.values()), {})
     shared = {name: value for name, value in first.items() if all(_has(c, name, value) for c in configs.values())}
     names = {cell.key: cell.name for cell in sweep.cells}

@@ -215,7 +215,7 @@ def schedule_conditions(evidence: Evidence, methods: list[Method], shown: list[s
     found: dict[str, Measured] = {}
     for method in methods:
         for cell in method.cells:
-            conditions = cell.record.get("notes", {}).get("schedule", {})
+            conditions = cell.record.notes.get("schedule", {}) if cell.record else {}
             name = str(method.axes.get("schedule"))
             if conditions and name not in found:
                 text = ", ".join(f"{c} {'holds' if true else 'fails'}" for c, true in sorted(conditions.items()))

@@ -6,6 +6,7 @@ A cell is `finished`, `diverged`, `failed`, ... as its run says, or `missing` wh
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -15,8 +16,9 @@ import numpy as np
 import pandas as pd
 
 from dadiff.errors import StoreError
-from dadiff.store import Results, StoredRun, Sweeps
+from dadiff.store import Record, Results, StoredRun, Sweeps
 from dadiff.store.files import read_json
+from dadiff.store.results import read_table
 from dadiff.tracking.markers import MARKER
 
 LOCAL_UI = "http://127.0.0.1:5000"
@@ -25,7 +27,7 @@ LOCAL_UI = "http://127.0.0.1:5000"
 
 @lru_cache(maxsize=64)
 def _table(folder: Path, name: str) -> pd.DataFrame:
-    return StoredRun(folder, {"status": "finished"}).table(name)
+    return read_table(folder, name)
 
 
 @lru_cache(maxsize=4096)
@@ -65,9 +67,23 @@ class Cell:
     means: dict[tuple[str, str], np.ndarray] = field(default_factory=dict, repr=False, compare=False)
 
     @property
-    def record(self) -> dict[str, Any]:
-        """The content of `run.json`; empty if nothing was stored."""
-        return self.run.record if self.run else {}
+    def record(self) -> Record | None:
+        """Of the stored run."""
+        return self.run.record if self.run else None
+
+    @property
+    def config(self) -> Mapping[str, Any]:
+        """The resolved configuration; empty if nothing was stored."""
+        return self.record.config if self.record else {}
+
+    @property
+    def counts(self) -> Mapping[str, int]:
+        """Of cases, samples and robots."""
+        return self.record.counts if self.record else {}
+
+    def link(self, kind: str) -> str | None:
+        """The key of what the run was made with: "cases", "denoiser", "recording"."""
+        return self.record.links.get(kind) if self.record else None
 
     @property
     def status(self) -> str:
@@ -77,9 +93,9 @@ class Cell:
     @property
     def outcome(self) -> str:
         """The status in words, with step or reason."""
-        reason = self.record.get("reason") or self.waiting
-        if self.status == "diverged" and self.record.get("diverged_step") is not None:
-            return f"diverged at step {self.record['diverged_step']}"
+        reason = (self.record.reason if self.record else None) or self.waiting
+        if self.record and self.status == "diverged" and self.record.diverged_step is not None:
+            return f"diverged at step {self.record.diverged_step}"
         return f"{self.status}: {reason}" if reason else self.status
 
     @property
@@ -92,7 +108,7 @@ class Cell:
         return [f"{_server(uri)}/#/experiments/{m['experiment_id']}/runs/{m['run_id']}" for uri, m in stores]
 
     @property
-    def metrics(self) -> dict[str, float]:
+    def metrics(self) -> Mapping[str, float]:
         """Headline scalars."""
         return self.run.metrics if self.run else {}
 
@@ -138,7 +154,7 @@ class Sweep:
         """Groups of cells that resolved to the same configuration."""
         groups: dict[str, list[Cell]] = {}
         for cell in self.cells:
-            same = json.dumps(cell.record["config"], sort_keys=True) if "config" in cell.record else cell.key
+            same = json.dumps(cell.config, sort_keys=True) if cell.record else cell.key
             groups.setdefault(same, []).append(cell)
         return [group for group in groups.values() if len(group) > 1]
 

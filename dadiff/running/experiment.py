@@ -24,7 +24,7 @@ from dadiff.evaluation.records import ChainRecorder, Snapshots, headline, merged
 from dadiff.projectors import AdmissibleSet, Known, Projection
 from dadiff.randomness import numpy_generator, torch_generator
 from dadiff.running.assembly import Experiment
-from dadiff.running.provenance import provenance
+from dadiff.running.provenance import record_of
 from dadiff.store import StoredRun
 from dadiff.systems import LinearSystem, Robots
 from dadiff.tasks import Scores
@@ -159,29 +159,26 @@ def _observers(experiment: Experiment, environment: np.ndarray) -> tuple[ChainRe
 
 def _store(experiment: Experiment, config: Mapping[str, Any], plans: Plans, started: float) -> StoredRun:
     """Evaluate and write. Of a diverged chain nothing but where it diverged, and how its distance went."""
-    identity, diverged_at = experiment.identity, plans.samples.diverged_at
-    artefacts = (identity.demonstrations, identity.cases, identity.denoiser, identity.recording)
-    record = {
-        "key": identity.key,
-        "name": identity.name,
-        "status": "finished" if diverged_at is None else "diverged",
-        "reason": None if diverged_at is None else f"a value exceeded the bound at step {diverged_at}",
-        "diverged_step": diverged_at,
-        "config": dict(config),
-        "axes": identity.axes,
-        "metrics": plans.measures,
-        "notes": {"cases": experiment.cases.notes, "schedule": experiment.parts["schedule"].conditions()},
-        "counts": _counts(experiment),
-        "links": {artefact.kind: artefact.key for artefact in artefacts if artefact},
-        "provenance": provenance(experiment.device, started),
-    }
+    diverged_at = plans.samples.diverged_at
     written = {"chain": plans.chain.table()} if plans.chain else {}
-    arrays = {}
+    metrics, arrays = dict(plans.measures), {}
     if diverged_at is None:
         scores = evaluate(experiment, plans.planned)
         written |= tables(scores)
-        record["metrics"] = {**headline(scores), **plans.measures}
+        metrics = headline(scores) | metrics
         arrays = examples(experiment, plans)
+    record = record_of(
+        experiment.identity,
+        config,
+        "finished" if diverged_at is None else "diverged",
+        started,
+        experiment.device,
+        reason=None if diverged_at is None else f"a value exceeded the bound at step {diverged_at}",
+        diverged_step=diverged_at,
+        metrics=metrics,
+        notes={"cases": experiment.cases.notes, "schedule": experiment.parts["schedule"].conditions()},
+        counts=_counts(experiment),
+    )
     text = yaml.safe_dump(dict(config), sort_keys=False)
     return experiment.results.write(record, config_text=text, tables=written, arrays=arrays)
 

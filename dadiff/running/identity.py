@@ -62,6 +62,12 @@ class Identity:
         """16 hexadecimal digits."""
         return digest(self.determined_by)
 
+    @property
+    def links(self) -> dict[str, str]:
+        """Kind -> key of what the run is made with."""
+        artefacts = (self.demonstrations, self.cases, self.denoiser, self.recording)
+        return {artefact.kind: artefact.key for artefact in artefacts if artefact}
+
 
 def digest(value: Any) -> str:
     """A stable hash of plain data: 16 hexadecimal digits."""

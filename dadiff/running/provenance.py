@@ -1,34 +1,64 @@
-"""Where a result comes from: versions, commit, machine and time."""
+"""What is recorded of a run: what it was, and where its result comes from."""
 
 from __future__ import annotations
 
 import platform
 import subprocess
 import time
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from dadiff import __version__
+from dadiff.running.identity import Identity
+from dadiff.store import Provenance, Record, Status
 
 PACKAGES = ("numpy", "scipy", "torch")
 
 
-def provenance(device: str, started: float) -> dict[str, Any]:
-    """What goes into a run's record.
+def record_of(
+    identity: Identity,
+    config: Mapping[str, Any],
+    status: Status,
+    started: float,
+    device: str | None = None,
+    **found: Any,
+) -> Record:
+    """The record of a run that ends now.
+
+    Args:
+        config: resolved.
+        started: as `time.time()` gives it.
+        found: further fields of the record.
+    """
+    return Record(
+        key=identity.key,
+        name=identity.name,
+        status=status,
+        config=dict(config),
+        axes=identity.axes,
+        links=identity.links,
+        provenance=provenance(started, device),
+        **found,
+    )
+
+
+def provenance(started: float, device: str | None = None) -> Provenance:
+    """That of what was begun here.
 
     Args:
         started: as `time.time()` gives it.
     """
-    return {
-        "versions": {"dadiff": __version__, "python": platform.python_version(), **{p: version(p) for p in PACKAGES}},
-        "commit": commit(),
-        "device": device,
-        "host": platform.node(),
-        "started": datetime.fromtimestamp(started, UTC).isoformat(timespec="seconds"),
-        "seconds": time.time() - started,
-    }
+    return Provenance(
+        host=platform.node(),
+        started=datetime.fromtimestamp(started, UTC).isoformat(timespec="seconds"),
+        seconds=time.time() - started,
+        device=device,
+        commit=commit(),
+        versions={"dadiff": __version__, "python": platform.python_version(), **{p: version(p) for p in PACKAGES}},
+    )
 
 
 def commit() -> str | None:

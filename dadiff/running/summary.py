@@ -26,7 +26,7 @@ def summary(runs: Sequence[StoredRun]) -> str:
 
 def _line(run: StoredRun, width: int) -> str:
     if run.status != "finished":
-        return f"{run.name:<{width}}  {run.status}: {run.record.get('reason') or ''}"
+        return f"{run.name:<{width}}  {run.status}: {run.record.reason or ''}"
     return f"{run.name:<{width}}" + "".join(f"{_number(run.metrics.get(name)):>17}" for name in COLUMNS.values())
 
 

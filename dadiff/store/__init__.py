@@ -5,7 +5,22 @@ Everything is written under a temporary name and renamed, so that a reader finds
 
 from dadiff.store.cache import Cache, Entry
 from dadiff.store.folder import store_id
-from dadiff.store.results import DONE, Results, StoredRun
+from dadiff.store.record import DONE, Provenance, Record, Status
+from dadiff.store.results import Results, StoredRun
 from dadiff.store.sweeps import Cell, Lease, Sweep, Sweeps
 
-__all__ = ["DONE", "Cache", "Cell", "Entry", "Lease", "Results", "StoredRun", "Sweep", "Sweeps", "store_id"]
+__all__ = [
+    "DONE",
+    "Cache",
+    "Cell",
+    "Entry",
+    "Lease",
+    "Provenance",
+    "Record",
+    "Results",
+    "Status",
+    "StoredRun",
+    "Sweep",
+    "Sweeps",
+    "store_id",
+]

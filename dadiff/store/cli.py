@@ -16,8 +16,7 @@ from dadiff.store.sweeps import Sweeps
 
 def users(output_dir: Path) -> Counter[tuple[str, str]]:
     """(kind, key) -> how many stored runs were made with this entry."""
-    links = (run.record.get("links", {}) for run in Results(output_dir))
-    return Counter((kind, key) for link in links for kind, key in link.items() if key)
+    return Counter(link for run in Results(output_dir) for link in run.record.links.items())
 
 
 def size_text(size: int) -> str:

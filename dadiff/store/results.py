@@ -8,7 +8,6 @@ A failed run is recorded too, with its reason; such a record gives way when the 
 from __future__ import annotations
 
 import logging
-import math
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager
@@ -17,14 +16,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dadiff.errors import LockedError, StoreError
-from dadiff.store.files import is_locked, locked, make_folder, read_json, sync_folder, write_json
+from dadiff.store.files import is_locked, locked, make_folder, sync_folder, write_json
+from dadiff.store.record import DONE, Record, Status, read_record
 
 if TYPE_CHECKING:
     import numpy as np
     import pandas as pd
-
-DONE = ("finished", "diverged", "infeasible", "refused")
-"""Statuses that are results (`refused`: the recording does not determine the dynamics); any other is done again."""
 
 RECORD = "run.json"
 PATIENCE_SECONDS = 2.0  # for a process that is just ending
@@ -38,37 +35,35 @@ class StoredRun:
 
     Args:
         folder: `runs/<key>`.
-        record: the content of `run.json`.
     """
 
     folder: Path
-    record: dict[str, Any]
+    record: Record
 
     @property
     def key(self) -> str:
         """The run's content-derived key, 16 hex digits."""
-        return self.record["key"]
+        return self.record.key
 
     @property
     def name(self) -> str:
         """The name for people."""
-        return self.record["name"]
+        return self.record.name
 
     @property
-    def status(self) -> str:
-        """One of `DONE`, or how the run failed."""
-        return self.record["status"]
+    def status(self) -> Status:
+        """How it ended."""
+        return self.record.status
 
     @property
-    def axes(self) -> dict[str, Any]:
+    def axes(self) -> Mapping[str, Any]:
         """The parameters worth showing, flat."""
-        return self.record.get("axes", {})
+        return self.record.axes
 
     @property
-    def metrics(self) -> dict[str, float]:
+    def metrics(self) -> Mapping[str, float]:
         """Headline scalars; nan where a value was not finite."""
-        stored = self.record.get("metrics", {})
-        return {name: math.nan if value is None else float(value) for name, value in stored.items()}
+        return self.record.metrics
 
     def has(self, name: str) -> bool:
         """Whether the run holds this table (without suffix)."""
@@ -80,15 +75,7 @@ class StoredRun:
         Raises:
             StoreError: if the run has no such table or it is damaged.
         """
-        import pandas as pd
-
-        path = self.folder / f"{name}.parquet"
-        if not path.is_file():
-            raise StoreError(f"{path}: this run (status {self.status}) has no such table")
-        try:
-            return pd.read_parquet(path)
-        except (OSError, ValueError) as error:
-            raise StoreError(f"{path}: is damaged ({error}); run it again with force=true") from error
+        return read_table(self.folder, name)
 
     def arrays(self, name: str = "examples") -> dict[str, np.ndarray]:
         """The arrays of an npz file; empty if the run has none."""
@@ -101,6 +88,23 @@ class StoredRun:
             return {key: stored[key] for key in stored.files}
 
 
+def read_table(folder: Path, name: str) -> pd.DataFrame:
+    """A table of the run in a folder.
+
+    Raises:
+        StoreError: if the run has no such table or it is damaged.
+    """
+    import pandas as pd
+
+    path = folder / f"{name}.parquet"
+    if not path.is_file():
+        raise StoreError(f"{path}: this run has no such table; see status and reason in its {RECORD}")
+    try:
+        return pd.read_parquet(path)
+    except (OSError, ValueError) as error:
+        raise StoreError(f"{path}: is damaged ({error}); run it again with force=true") from error
+
+
 class Results:
     """The runs below an output folder."""
 
@@ -111,7 +115,7 @@ class Results:
         """Where a run lies, whether it exists or not."""
         return self.root / key
 
-    def status(self, key: str) -> str | None:
+    def status(self, key: str) -> Status | None:
         """The status of a stored run; None if there is none."""
         return self.read(key).status if (self.folder(key) / RECORD).is_file() else None
 
@@ -126,7 +130,7 @@ class Results:
             DataError: if there is none, or its record is damaged.
             StoreError: if its format is newer than this version reads.
         """
-        return StoredRun(self.folder(key), read_json(self.folder(key) / RECORD))
+        return StoredRun(self.folder(key), read_record(self.folder(key) / RECORD))
 
     def __iter__(self) -> Iterator[StoredRun]:
         """All stored runs, failed ones among them, in the order of their names."""
@@ -147,7 +151,7 @@ class Results:
 
     def write(
         self,
-        record: Mapping[str, Any],
+        record: Record,
         *,
         config_text: str = "",
         tables: Mapping[str, pd.DataFrame] | None = None,
@@ -156,7 +160,6 @@ class Results:
         """Store a run whole, in place of an older one with its key.
 
         Args:
-            record: the content of `run.json` without its format; "key", "name" and "status" are needed.
             config_text: the resolved configuration as yaml, for people.
             tables: name -> table, each a parquet file.
             arrays: what goes into `examples.npz`.
@@ -166,9 +169,8 @@ class Results:
         """
         import numpy as np
 
-        key = record["key"]
         make_folder(self.root)
-        work = self.root / f".writing-{key}"
+        work = self.root / f".writing-{record.key}"
         shutil.rmtree(work, ignore_errors=True)
         make_folder(work)
         for name, table in (tables or {}).items():
@@ -177,20 +179,19 @@ class Results:
             np.savez(work / "examples.npz", **dict(arrays))  # type: ignore[arg-type]
         if config_text:
             (work / "config.yaml").write_text(config_text)
-        write_json(work / RECORD, dict(record))
+        write_json(work / RECORD, record.to_json())
         sync_folder(work)
-        _replace(work, self.folder(key))
-        return self.read(key)
+        _replace(work, self.folder(record.key))
+        return self.read(record.key)
 
-    def write_failure(self, record: Mapping[str, Any], status: str, reason: str) -> None:
+    def write_failure(self, record: Record) -> None:
         """Record how a run failed, unless a result with its key is there already, or on its way."""
-        key = record["key"]
         try:
-            with locked(self._lock_file(key), f"run {key}", PATIENCE_SECONDS):
-                if not self.is_done(key):
-                    self.write({**record, "status": status, "reason": reason})
+            with locked(self._lock_file(record.key), f"run {record.key}", PATIENCE_SECONDS):
+                if not self.is_done(record.key):
+                    self.write(record)
         except LockedError:
-            log.info("run %s: failed here (%s), but another process works on it", key, reason)
+            log.info("run %s: failed here (%s), but another process works on it", record.key, record.reason)
 
     def _lock_file(self, key: str) -> Path:
         return self.root / ".locks" / f"{key}.lock"

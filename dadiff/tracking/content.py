@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
@@ -49,27 +49,24 @@ class Content:
 
 def run_content(run: StoredRun) -> Content:
     """Axes as parameters, headline scalars, error curves with step = t, and what identifies the run."""
-    provenance = run.record.get("provenance", {})
-    versions = provenance.get("versions", {})
-    links = {kind: key for kind, key in run.record.get("links", {}).items() if key}
+    made = run.record.provenance
+    commit = {"commit": made.commit, "mlflow.source.git.commit": made.commit}
     tags = {
         "status": run.status,
-        **{f"version.{name}": str(version) for name, version in versions.items()},
-        **{f"link.{kind}": key for kind, key in links.items()},
-        **{name: str(provenance[name]) for name in ("device", "commit") if provenance.get(name)},
+        **{f"version.{name}": version for name, version in made.versions.items()},
+        **{f"link.{kind}": key for kind, key in run.record.links.items()},
+        **{name: value for name, value in {"device": made.device, **commit}.items() if value},
         "mlflow.note.content": run_note(run),
     }
-    if provenance.get("commit"):
-        tags["mlflow.source.git.commit"] = str(provenance["commit"])
     params = {name: _text(value) for name, value in run.axes.items()}
-    return Content(params, scalars(run) + curves(run), tags, artifacts(run.folder), *times(provenance))
+    return Content(params, scalars(run) + curves(run), tags, artifacts(run.folder), *times(made.started, made.seconds))
 
 
 def scalars(run: StoredRun) -> list[tuple[str, float, int]]:
     """The headline scalars, and the step at which a run diverged."""
     values = dict(run.metrics)
-    if run.record.get("diverged_step") is not None:
-        values["diverged_step"] = float(run.record["diverged_step"])
+    if run.record.diverged_step is not None:
+        values["diverged_step"] = float(run.record.diverged_step)
     return [(name, value, 0) for name, value in values.items() if math.isfinite(value)]
 
 
@@ -91,8 +88,8 @@ def _columns(table: pd.DataFrame, index: str, prefix: str = "") -> list[tuple[st
 
 def run_note(run: StoredRun) -> str:
     """The run in a few sentences of markdown."""
-    counts = ", ".join(f"{count} {what}" for what, count in run.record.get("counts", {}).items() if count)
-    lines = [f"**{run.name}**: {run.status}" + (f" ({run.record['reason']})" if run.record.get("reason") else "") + "."]
+    counts = ", ".join(f"{count} {what}" for what, count in run.record.counts.items() if count)
+    lines = [f"**{run.name}**: {run.status}" + (f" ({run.record.reason})" if run.record.reason else "") + "."]
     if counts:
         lines.append(f"Headline metrics are means over {counts} and over time; `{OVER_TIME}…` are means at each t.")
     if run.axes:
@@ -113,7 +110,7 @@ def training_content(manifest: dict[str, Any], folder: Path) -> Content:
     note = f"Training of the denoiser `{manifest['key']}`, shared by every run whose tag `link.denoiser` names it."
     tags = {"status": "finished", "mlflow.note.content": f"{note}\n\nThe weights lie in `{folder}`."}
     params = {name: _text(value) for name, value in identity.items()}
-    return Content(params, metrics, tags, artifacts(folder), *times({"started": manifest.get("created")}))
+    return Content(params, metrics, tags, artifacts(folder), *times(manifest.get("created")))
 
 
 def sweep_content(sweep: Sweep, table_file: Path) -> Content:
@@ -190,12 +187,12 @@ def flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     return parts
 
 
-def times(provenance: dict[str, Any]) -> tuple[int | None, int]:
+def times(started: str | None, seconds: float = 0.0) -> tuple[int | None, int]:
     """When the work began and ended, in ms since 1970; None and 0 where that is not recorded."""
-    if not provenance.get("started"):
+    if started is None:
         return None, 0
-    started = datetime.fromisoformat(provenance["started"]).timestamp()
-    return int(1000 * started), int(1000 * (started + float(provenance.get("seconds") or 0)))
+    began = datetime.fromisoformat(started).timestamp()
+    return int(1000 * began), int(1000 * (began + seconds))
 
 
 def chunks(items: Sequence[Any], size: int) -> list[Sequence[Any]]:
@@ -203,7 +200,7 @@ def chunks(items: Sequence[Any], size: int) -> list[Sequence[Any]]:
     return [items[first : first + size] for first in range(0, len(items), size)]
 
 
-def _rows(values: dict[str, Any]) -> list[str]:
+def _rows(values: Mapping[str, Any]) -> list[str]:
     return [f"| {name} | {_text(value)} |" for name, value in values.items()]
 
 

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING
 
 from dadiff.errors import StoreError
 from dadiff.store import Cell, Results, Sweep, Sweeps
-from dadiff.store.files import make_folder, read_json
+from dadiff.store.files import make_folder
+from dadiff.store.record import read_record
 from dadiff.store.results import RECORD
 from dadiff.tracking.client import open_client, refused
 
@@ -70,5 +71,5 @@ def _fetch(client: MlflowClient, run: Run, folder: Path) -> Cell:
     target = make_folder(Results(folder).folder(key))
     for path in files:
         client.download_artifacts(run.info.run_id, path, str(target))
-    record = read_json(target / RECORD)
-    return Cell(key, record["name"], record["axes"], record["status"], record.get("reason"))
+    record = read_record(target / RECORD)
+    return Cell(key, record.name, dict(record.axes), record.status, record.reason)
