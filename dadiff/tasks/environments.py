@@ -7,13 +7,18 @@ Absent slots are zero. E holds the whole environment, so that `decode` undoes `e
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 
 from dadiff.errors import DataError, InfeasibleError
+from dadiff.tasks.task import numbers
 from dadiff.trajectory.layout import Array, Channel, Layout
+
+REQUIRED, OPTIONAL = ("x_init", "target"), ("waypoints", "obstacles")
+PARTS = {"waypoints": ("position", "time"), "obstacles": ("centre", "radius")}
 
 
 @dataclass(frozen=True)
@@ -151,3 +156,48 @@ def _check_clear(one: Environments, time_step: float, place: str) -> None:
 
 def _show(value: np.ndarray) -> str:
     return "(" + ", ".join(f"{v:g}" for v in np.ravel(value)) + ")"
+
+
+def parse(record: Any, max_waypoints: int, max_obstacles: int, place: str) -> Environments:
+    """One environment (N = 1) from a mapping with x_init, target, and lists of waypoints and obstacles.
+
+    Raises:
+        DataError: naming place and field, if something is missing, not known, or of a wrong shape.
+    """
+    _check_keys(record, place, REQUIRED, OPTIONAL)
+    x_init, target = numbers(record["x_init"], "x_init", (4,), place), numbers(record["target"], "target", (2,), place)
+    waypoints = _slots(record, "waypoints", max_waypoints, place)
+    obstacles = _slots(record, "obstacles", max_obstacles, place)
+    parts = (x_init, target, *_columns(waypoints), *_columns(obstacles))
+    return Environments(*(part[None] for part in parts))
+
+
+def _slots(record: Mapping[str, Any], field: str, most: int, place: str) -> np.ndarray:
+    """The slots of a field, (most, 4): x, y, time or radius, mask."""
+    items = record.get(field) or []
+    if not isinstance(items, list):
+        raise DataError(f"{place}: {field} is {type(items).__name__}; expected a list")
+    if len(items) > most:
+        raise DataError(f"{place}: {field} are {len(items)}; task.max_{field} is {most}, and so is a model's")
+    point, number = PARTS[field]
+    slots = np.zeros((most, 4))
+    for k, item in enumerate(items):
+        where = f"{place}: {field}[{k}]"
+        _check_keys(item, where, PARTS[field], ())
+        slots[k] = [*numbers(item[point], point, (2,), where), *numbers(item[number], number, (1,), where), 1]
+    return slots
+
+
+def _columns(slots: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    return slots[:, :2], slots[:, 2], slots[:, 3] > 0
+
+
+def _check_keys(record: Any, place: str, required: tuple[str, ...], optional: tuple[str, ...]) -> None:
+    if not isinstance(record, Mapping):
+        raise DataError(f"{place}: expected a mapping with {', '.join(required)}; found {type(record).__name__}")
+    for name in required:
+        if name not in record:
+            raise DataError(f"{place}: '{name}' is missing; expected {', '.join(required)}")
+    for name in record:
+        if name not in required + optional:
+            raise DataError(f"{place}: '{name}' is not known; expected {', '.join(required + optional)}")

@@ -7,7 +7,7 @@ each robot solved by its own optimum. Every test robot is given the same cases.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
@@ -18,7 +18,7 @@ from dadiff.errors import ConfigError
 from dadiff.randomness import numpy_generator
 from dadiff.systems import Family, GaussianExcitation, Recording, Robots
 from dadiff.tasks.lqr import LQR, ends_layout
-from dadiff.tasks.task import Cases, Demonstrations, Scores
+from dadiff.tasks.task import Cases, Demonstrations, Scores, encoded
 from dadiff.trajectory import Channel, Layout
 from dadiff.trajectory.response import along
 
@@ -101,6 +101,10 @@ class Fleet:
         recording = Channel("recording", transition, 0, self.recording_length - 1)
         told = {"nothing": (), "robot_parameters": (parameters,), "recording": (recording,)}
         return Layout((*ends_layout(system).channels, *told[self.condition_on]))
+
+    def environment(self, system: Robots, given: Mapping[str, object]) -> np.ndarray:
+        """E (c,) from its fields, each of them checked."""
+        return encoded(self.condition(system), given)
 
     def demonstrations(self, system: Family, count: int, rng: np.random.Generator) -> Demonstrations:
         """`count` noisy runs of its expert for each training robot, each in an environment of its own."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
@@ -12,7 +12,7 @@ import numpy as np
 from dadiff.errors import ConfigError
 from dadiff.experts.lqr import AffineFeedback, GaussianLaw, closed_loop_law, optimal_feedback, stationary_feedback
 from dadiff.systems import LinearSystem
-from dadiff.tasks.task import Cases, Demonstrations, Scores
+from dadiff.tasks.task import Cases, Demonstrations, Scores, encoded
 from dadiff.trajectory import Channel, Layout
 from dadiff.trajectory.response import along
 
@@ -77,6 +77,10 @@ class LQR:
     def condition(self, system: LinearSystem) -> Layout:
         """E = [x_init; target], each (n,)."""
         return ends_layout(system)
+
+    def environment(self, system: LinearSystem, given: Mapping[str, object]) -> np.ndarray:
+        """E (c,) from its fields, each of them checked."""
+        return encoded(self.condition(system), given)
 
     def feedback(self, system: LinearSystem) -> AffineFeedback:
         """The expert's controller.

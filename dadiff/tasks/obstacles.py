@@ -7,7 +7,7 @@ its waypoint and input costs and constrains the distance instead (see `dadiff.ex
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -101,6 +101,17 @@ class Obstacles:
     def condition(self, system: LinearSystem | None = None) -> Layout:
         """E: x_init (4), target (2), and slots of waypoints (W, 4) and obstacles (O, 4)."""
         return env.condition(self.max_waypoints, self.max_obstacles)
+
+    def environment(self, system: LinearSystem, given: Mapping[str, object]) -> np.ndarray:
+        """E (c,) from x_init, target, and lists of waypoints {position, time} and obstacles {centre, radius}.
+
+        Raises:
+            DataError: naming what is missing, not known, or unusable.
+            InfeasibleError: if start, waypoint or target lies inside a disc.
+        """
+        environments = env.parse(given, self.max_waypoints, self.max_obstacles, "condition")
+        env.check(environments, self.horizon, time_step_of(system), where="condition: ")
+        return env.encode(environments, self.horizon)[0]
 
     def demonstrations(self, system: LinearSystem, count: int, rng: np.random.Generator) -> Demonstrations:
         """Optima in `count` drawn environments; those that the expert could not solve are left out and counted."""

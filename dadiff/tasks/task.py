@@ -6,11 +6,13 @@ their dimension comes first, written `*robots`.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
 
+from dadiff.errors import DataError
 from dadiff.systems import LinearSystem
 from dadiff.trajectory import Layout
 
@@ -86,6 +88,10 @@ class Task(Protocol):
         """The channels of the condition vector E, x_init among them, for what `target` returned."""
         ...
 
+    def environment(self, system: LinearSystem, given: Mapping[str, object]) -> np.ndarray:
+        """E (c,) of one environment that is given by its fields, each of them checked."""
+        ...
+
     def demonstrations(self, system: LinearSystem, count: int, rng: np.random.Generator) -> Demonstrations:
         """`count` expert demonstrations (a robot) in fresh environments."""
         ...
@@ -97,3 +103,40 @@ class Task(Protocol):
     def score(self, system: LinearSystem, cases: Cases, planned: np.ndarray, rollout: np.ndarray) -> Scores:
         """Scores of plans (*robots, cases, samples, d), as planned and after replaying their inputs."""
         ...
+
+
+def encoded(condition: Layout, given: Mapping[str, object], place: str = "condition") -> np.ndarray:
+    """E (c,) from its fields by name, each a channel of the layout.
+
+    Args:
+        place: what messages begin with.
+
+    Raises:
+        DataError: naming the first field that is missing, not known, of another shape, or not finite.
+    """
+    for name in given:
+        if name not in condition:
+            raise DataError(f"{place}: '{name}' is not known; expected {', '.join(condition.names)}")
+    for name in condition.names:
+        if name not in given:
+            raise DataError(f"{place}: '{name}' is missing; expected {', '.join(condition.names)}")
+    return condition.pack(**{name: numbers(given[name], name, condition.channel(name).shape, place) for name in given})
+
+
+def numbers(value: object, field: str, shape: tuple[int, ...], place: str) -> np.ndarray:
+    """A field as finite floats of a shape; a single number stands for (1,).
+
+    Raises:
+        DataError: naming place and field.
+    """
+    size = " x ".join(map(str, shape))
+    try:
+        values = np.atleast_1d(np.asarray(value, dtype=np.float64))
+    except (TypeError, ValueError) as error:
+        raise DataError(f"{place}: {field} is {value!r}; expected {size} numbers") from error
+    if values.shape != shape:
+        raise DataError(f"{place}: {field} has shape {values.shape}; expected {size} numbers")
+    if not np.isfinite(values).all():
+        shown = ", ".join(f"{v:g}" for v in values.ravel())
+        raise DataError(f"{place}: {field} is ({shown}); every number must be finite")
+    return values
