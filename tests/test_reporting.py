@@ -19,7 +19,7 @@ from made_up import MadeUp, example_arrays
 
 from dadiff.errors import ConfigError, StoreError
 from dadiff.reporting import cli, configurations, labels, latex
-from dadiff.reporting.aggregation import Evidence, case_means, case_scalars, pair, varying
+from dadiff.reporting.aggregation import Evidence, grid, pair, varying
 from dadiff.reporting.definitions import Item, for_sweep, load, names
 from dadiff.reporting.figures import paths
 from dadiff.reporting.figures.style import COLOURS, MARKERS, RC, looks_of, render
@@ -27,6 +27,7 @@ from dadiff.reporting.render import to_json
 from dadiff.reporting.report import build
 from dadiff.reporting.selection import matches
 from dadiff.reporting.sources import read_sweeps, without_password
+from dadiff.reporting.statistics import ratio
 
 STORE = Path(__file__).parent / "data" / "store"
 EXPECTED = Path(__file__).parent / "data" / "expected"
@@ -68,8 +69,9 @@ def test_tables_hold_the_means_of_the_stored_plans(report):
     known = evidence("lqr_made_up").methods({"projector": "known", "enforcement": "post_hoc"})[0]
     errors = [cell.table("per_step")["planned_state_error"].mean() for cell in known.finished]
     row = rows[next(label for label in rows if label.startswith("known") and "once at the end" in label)]
-    assert float(row["planned_state_error_mean"]) == pytest.approx(np.mean(errors), rel=1e-5)
-    assert float(row["planned_state_error_mean_low"]) < np.mean(errors) < float(row["planned_state_error_mean_high"])
+    mean = np.exp(np.mean(np.log(errors)))  # of the runs' means, geometric
+    assert float(row["planned_state_error_mean"]) == pytest.approx(mean, rel=1e-5)
+    assert float(row["planned_state_error_mean_low"]) < mean < float(row["planned_state_error_mean_high"])
     assert float(row["planned_state_error_ratio"]) == pytest.approx(0.6, rel=0.1)
     assert row["runs"].split() == known.keys
 
@@ -144,9 +146,9 @@ def test_every_part_says_how_to_make_it_again_and_from_how_much(report):
     assert content["commands"][0] == "dadiff +sweeps=lqr_made_up"
     facts = content["figures"]["errors"]["facts"]
     assert facts.startswith(
-        "3 training seeds, 3 recordings, 6 cases, 3 plans a case. 95 % intervals by a bootstrap over"
+        "3 training seeds, 3 recordings, 6 cases, 3 plans a case. 95 % intervals from an analysis of variance over"
     )
-    assert facts.endswith("seeds and cases, widened for 3 seeds by Student's t.")
+    assert facts.endswith("seeds and cases, each run with cases of its own.")
     assert "interval" not in content["figures"]["theorem1"]["facts"]
     page = (report / "index.html").read_text()
     shown = [part for part in (*content["tables"].values(), *content["figures"].values()) if part["runs"]]
@@ -232,7 +234,8 @@ def test_curves_are_the_means_and_lie_in_their_bands():
     errors = next(part.content for part in content.figures if part.item.id == "errors")
     vanilla = next(curve for curve in errors.panels[0].curves if curve.label == "vanilla")
     method = evidence("lqr_made_up").methods({"projector": "none", "denoiser": "mlp"})[0]
-    np.testing.assert_allclose(vanilla.band.value, case_means(method.finished, "planned_state_error").mean((0, 1)))
+    runs = method.runs.curves("planned_state_error").values.mean(axis=1)
+    np.testing.assert_allclose(vanilla.band.value, np.exp(np.log(runs).mean(axis=0)))
     assert (vanilla.band.low < vanilla.band.value).all()
     assert (vanilla.band.value < vanilla.band.high).all()
     inputs = next(curve for curve in errors.panels[1].curves if curve.label == "vanilla")
@@ -274,8 +277,45 @@ def test_replicates_are_pooled_and_paired_by_seed():
     assert len(methods["post_hoc"].finished) == 3
     partner = evidence("lqr_made_up").partner(methods["post_hoc"], {"projector": "none"})
     own, theirs = pair(methods["post_hoc"], partner)
-    assert [cell.axes["seed"] for cell in own] == [cell.axes["seed"] for cell in theirs] == [0, 1, 2]
-    assert case_scalars(own, "planned_state_error").shape == (3, 6)
+    assert [cell.axes["seed"] for cell in own.cells] == [cell.axes["seed"] for cell in theirs.cells] == [0, 1, 2]
+    assert own.levels == ("seed",)
+    assert own.nested
+    assert own.scalars("planned_state_error").values.shape == (3, 6)
+
+
+@pytest.mark.parametrize(
+    ("seeds", "levels", "places"),
+    [
+        ([{"seed": 0, "dataset.seed": 0}], ("seed",), [0]),
+        ([{"seed": s, "training.seed": s} for s in (0, 1)], ("seed",), [0, 1]),
+        ([{"seed": s, "recording.seed": r} for s in (0, 1) for r in (5, 6)], ("seed", "recording"), [[0, 1], [2, 3]]),
+        ([{"training.seed": s, "recording.seed": r} for s, r in ((1, 5), (0, 5), (0, 6), (1, 6), (2, 6))],
+         ("training seed", "recording"), [[1, 2], [0, 3]]),
+        ([{"seed": s, "recording.seed": r} for s, r in enumerate((0, 1, 1, 2, 3))], ("run",), [*range(5)]),
+    ],
+)  # fmt: skip
+def test_runs_stand_in_a_grid_by_what_was_drawn_anew(seeds, levels, places):
+    found = grid(seeds)
+    assert found[0] == levels
+    assert sorted(found[1].ravel().tolist()) == sorted(np.ravel(places).tolist())
+    assert found[1].shape == np.shape(places)
+
+
+def test_recordings_are_a_factor_beside_the_trained_network(tmp_path):
+    store = MadeUp(tmp_path)
+    for seed in range(3):
+        store.run(1.0, seed=seed)
+        for recording, level in enumerate((0.3, 0.6, 1.2, 2.4)):
+            store.run(level, projector="hankel", enforcement="normalised", seed=seed, recording__length=100,
+                      recording__seed=recording)  # fmt: skip
+    store.sweep()
+    vanilla, hankel = Evidence(read_sweeps(tmp_path, [store.name])).all_methods
+    own, theirs = pair(hankel, vanilla)
+    assert (own.levels, own.cells.shape) == (("seed", "recording"), (3, 4))
+    assert (theirs.levels, theirs.cells.shape) == (("seed",), (3,))
+    estimate = ratio(own.scalars("gap"), theirs.scalars("gap"))
+    assert estimate.value == pytest.approx(np.sqrt(0.3 * 2.4), rel=0.1)
+    assert estimate.low < 0.4
 
 
 def test_presets_go_by_the_projector_that_they_set(tmp_path):
@@ -290,8 +330,8 @@ def test_presets_go_by_the_projector_that_they_set(tmp_path):
 
 def test_robots_by_group():
     method = evidence("fleet_made_up").methods({"projector": "none"})[0]
-    everyone = case_scalars(method.finished, "cost_ratio")
-    groups = [case_scalars(method.finished, "cost_ratio", group) for group in ("interpolation", "extrapolation")]
+    everyone = method.runs.scalars("cost_ratio").values
+    groups = [method.runs.scalars("cost_ratio", group).values for group in ("interpolation", "extrapolation")]
     assert everyone.shape == (1, 8, 4)
     np.testing.assert_array_equal(np.concatenate(groups, axis=1), everyone)
 
@@ -323,7 +363,7 @@ def test_rows_that_are_missing_from_a_table_are_an_error(tmp_path):
     shutil.copytree(tmp_path, tmp_path.with_name("copy"))
     everything = Evidence(read_sweeps(tmp_path.with_name("copy"), [store.name]))
     with pytest.raises(StoreError, match="expected each once"):
-        case_means(everything.all_methods[0].finished, "gap")
+        everything.all_methods[0].runs.curves("gap")
 
 
 def test_an_unknown_sweep_names_those_that_exist(capsys):

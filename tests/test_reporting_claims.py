@@ -78,7 +78,7 @@ def ratio_store(folder: Path, claim: Claim, truth: str) -> MadeUp:
     return store
 
 
-def difference_store(folder: Path, claim: Claim, truth: str) -> MadeUp:
+def time_course_store(folder: Path, claim: Claim, truth: str) -> MadeUp:
     store, axes = MadeUp(folder, cases=30), concrete(claim.cells)
     store.run(1.0, spread=0.3, **baseline_axes(claim, axes))
     store.run({"holds": 0.3, "does not hold": 3.0, "undecided": 1.0}[truth], spread=0.3, **axes)
@@ -131,7 +131,7 @@ def schedule_store(folder: Path, claim: Claim, truth: str) -> MadeUp:
 STORES = {
     "level": level_store,
     "ratio_to": ratio_store,
-    "worst_difference": difference_store,
+    "at_every_time": time_course_store,
     "dip": dip_store,
     "longest_over_shortest": length_store,
     "share_grew": chain_store,
@@ -199,7 +199,7 @@ def test_a_verdict_from_a_part_of_the_seeds_says_so(tmp_path):
     store.run(status="failed", reason="out of memory", seed=1, projector="known", enforcement="normalised")
     store.run(stored=False, seed=2, projector="known", enforcement="normalised")
     verdict = judged(store, claim)
-    assert "(1 of 3 replicates: failed: out of memory; missing)" in verdict.lines[0]
+    assert "(1 of 3 runs: failed: out of memory; missing)" in verdict.lines[0]
     assert len(verdict.runs) == 2  # the pair that was compared
 
 

@@ -1,36 +1,86 @@
 """From cells to methods: which cells are replicates of one another, and what each is compared to.
 
-A method is what a reader compares: all axes but those of replication (seeds). Its values have the axes
-(replicates, [robots,] cases[, t]); plans of one case are averaged. Replicates that are missing, failed or
-diverged are named beside the method and never enter a mean; a method is `complete` only without any.
+A method is what a reader compares: all axes but those of replication, which are seeds. Its finished runs stand in a
+grid by what was drawn anew between them (training seed, recording, ...), and their results have the axes of the grid,
+then robots and cases; plans of one case are averaged. Runs that are missing, failed or diverged are named beside the
+method and never enter a mean.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from dadiff.errors import StoreError
-from dadiff.randomness import numpy_generator
 from dadiff.reporting.selection import Selector, matches
 from dadiff.reporting.sources import Cell, Sweep
-from dadiff.reporting.statistics import bootstrap_weights
+from dadiff.reporting.statistics import Draws
 
-RESAMPLES = 1000
 PRESETS = ("_fixed", "_unchecked")  # what they set is an axis of its own
 ALIASES = ("projector.initial_state",)  # stored as `initial_state`, too
 FIRST = ("task", "projector", "enforcement", "initial_state", "recording.length", "system.process_noise", "denoiser")
 LEVELS = ("robot", "case", "sample", "t")
 
 
-@lru_cache(maxsize=4)
-def weights_for(levels: tuple[int, ...]) -> np.ndarray:
-    """The resamples of arrays with these levels: the same for every method, so that comparisons are paired."""
-    return bootstrap_weights(levels, RESAMPLES, numpy_generator(0, "report"))
+FLOORS = {"cost_ratio": 1.0, "median_cost_ratio": 1.0}
+"""What metrics cannot go below, where it is not 0: a cost over the optimal cost."""
+
+DRAWN = {"seed": "seed", "training.seed": "training seed", "recording.seed": "recording", "dataset.seed": "data set",
+         "evaluation.seed": "noise of sampling", "task.seed": "draw of the robots"}  # fmt: skip
+"""What a seed draws anew."""
+
+
+@dataclass(frozen=True)
+class Runs:
+    """Finished runs by what was drawn anew between them, each draw with each other.
+
+    Args:
+        levels: names of the grid's axes.
+        cells: the runs, (*levels).
+    """
+
+    levels: tuple[str, ...]
+    cells: np.ndarray
+
+    @property
+    def keys(self) -> list[str]:
+        """Keys of the runs, each once."""
+        return list(dict.fromkeys(cell.key for cell in self.cells.ravel()))
+
+    @property
+    def nested(self) -> bool:
+        """Whether the runs have cases of their own."""
+        return len({cell.link("cases") for cell in self.cells.ravel()}) > 1
+
+    def curves(self, metric: str, group: str | None = None) -> Draws:
+        """A metric's means over the plans of each case: (*levels, [robots,] cases[, T+1]).
+
+        Args:
+            group: of a fleet, the robots of this group alone.
+
+        Raises:
+            StoreError: if a run has no such metric, rows are missing, or runs differ in size.
+        """
+        found = [_of_cell(cell, metric, group) for cell in self.cells.ravel()]
+        shapes = sorted({array.shape for array in found})
+        if len(shapes) > 1:
+            raise StoreError(f"metric {metric}: replicates have shapes {shapes}; expected one; rerun with equal sizes")
+        units = shapes[0][:-1] if _along_time(self.cells.ravel()[0], metric) else shapes[0]
+        names = ("robot", "case")[2 - len(units) :]
+        return Draws(np.stack(found).reshape(*self.cells.shape, *shapes[0]), self.levels + names, self.nested)
+
+    def scalars(self, metric: str, group: str | None = None) -> Draws:
+        """As `curves`, with metrics along time averaged over the times at which they are defined."""
+        draws = self.curves(metric, group)
+        if not _along_time(self.cells.ravel()[0], metric):
+            return draws
+        defined = ~np.isnan(draws.values).all(axis=tuple(range(len(draws.levels))))
+        return Draws(draws.values[..., defined].mean(axis=-1), draws.levels, draws.nested)
 
 
 @dataclass(frozen=True)
@@ -60,10 +110,16 @@ class Method:
         """Whether a replicate diverged: a result of the method, not a gap."""
         return any(cell.status == "diverged" for cell in self.cells)
 
+    @cached_property
+    def runs(self) -> Runs:
+        """The finished runs that numbers come from."""
+        levels, places = grid([seeds_of(cell) for cell in self.finished])
+        return Runs(levels, _objects(self.finished)[places])
+
     @property
     def keys(self) -> list[str]:
         """Keys of the runs that numbers come from."""
-        return [cell.key for cell in self.finished]
+        return self.runs.keys if self.finished else []
 
     @property
     def outcome(self) -> str:
@@ -106,7 +162,7 @@ class Evidence:
 
         None if there is none, or if no two of their finished runs are of the same draw.
         """
-        found = [other for other in self.methods(against) if _alike(method, other, against) and _pairs(method, other)]
+        found = [other for other in self.methods(against) if _alike(method, other, against) and pairs(method, other)]
         return found[0] if found else None
 
 
@@ -128,20 +184,39 @@ def _alike(method: Method, other: Method, against: Selector) -> bool:
     return all(method.axes[name] == other.axes[name] for name in shared if name not in against)
 
 
-def pair(method: Method, other: Method) -> tuple[list[Cell], list[Cell]]:
-    """Replicates that both have, in the same order: same seed, and same recording where both use one.
+def pair(method: Method, other: Method) -> tuple[Runs, Runs]:
+    """Runs that both have: of the same seed, and of the same recording where both use one.
 
     Raises:
         StoreError: if two paired runs were not made on the same cases.
     """
-    pairs = _pairs(method, other)
-    for a, b in pairs:
+    found = pairs(method, other)
+    for a, b in found:
         if a.link("cases") != b.link("cases"):
             raise StoreError(f"runs {a.key} and {b.key}: their data sets differ, so their cases cannot be paired")
-    return [a for a, _ in pairs], [b for _, b in pairs]
+    levels, places = grid([{**seeds_of(b), **seeds_of(a)} for a, b in found])
+    own, theirs = ([two[side] for two in found] for side in (0, 1))
+    return _narrowed(Runs(levels, _objects(own)[places])), _narrowed(Runs(levels, _objects(theirs)[places]))
 
 
-def _pairs(method: Method, other: Method) -> list[tuple[Cell, Cell]]:
+def _narrowed(runs: Runs) -> Runs:
+    """Without the levels over which the same run is repeated; one level stays."""
+    levels, cells = runs.levels, runs.cells
+    for axis in reversed(range(cells.ndim)):
+        keys = np.array([cell.key for cell in cells.ravel()]).reshape(cells.shape)
+        if cells.ndim > 1 and (keys == keys.take([0], axis=axis)).all():
+            levels, cells = levels[:axis] + levels[axis + 1 :], cells.take(0, axis=axis)
+    return Runs(levels, cells)
+
+
+def _objects(cells: list[Cell]) -> np.ndarray:
+    found = np.empty(len(cells), dtype=object)
+    found[:] = cells
+    return found
+
+
+def pairs(method: Method, other: Method) -> list[tuple[Cell, Cell]]:
+    """Finished runs of both that are of the same draw."""
     return [(a, b) for a in method.finished for b in other.finished if _same_draw(a, b)]
 
 
@@ -150,31 +225,51 @@ def _same_draw(a: Cell, b: Cell) -> bool:
     return all(a.axes[name] in (b.axes[name], None) for name in shared)
 
 
-def case_means(cells: list[Cell], metric: str, group: str | None = None) -> np.ndarray:
-    """Means over the plans of each case: (replicates, [robots,] cases[, T+1]).
+def seeds_of(cell: Cell) -> dict[str, Any]:
+    """The axes of replication that apply to a cell."""
+    return {name: value for name, value in cell.axes.items() if is_seed(name) and value is not None}
 
-    Metrics with one value a run come as (replicates,).
 
-    Args:
-        group: of a fleet, the robots of this group alone.
+def grid(seeds: list[dict[str, Any]]) -> tuple[tuple[str, ...], np.ndarray]:
+    """Names of what varies between runs, and the places of runs that make a full grid over it.
 
-    Raises:
-        StoreError: if a run has no such metric, rows are missing, or replicates differ in size.
+    Seeds that follow one another are one level, named after the first. Of a grid with gaps the seed or recording with
+    the most of them is left out until there are none; where that costs more than half of the runs they are one level.
     """
-    arrays = [_of_cell(cell, metric, group) for cell in cells]
-    shapes = sorted({array.shape for array in arrays})
-    if len(shapes) > 1:
-        raise StoreError(f"metric {metric}: replicates have shapes {shapes}; expected one; rerun with equal sizes")
-    return np.stack(arrays)
+    axes = _drawn_anew(seeds)
+    kept = list(range(len(seeds)))
+    while len(kept) < _full(seeds, kept, axes):
+        counts = [(sum(seeds[k].get(a) == v for k in kept) * len(_values(seeds, a, kept)), a, v)
+                  for a in axes for v in _values(seeds, a, kept)]  # fmt: skip
+        _, axis, value = min(counts, key=lambda found: found[0])
+        kept = [k for k in kept if seeds[k].get(axis) != value]
+    if 2 * len(kept) < len(seeds) or len(kept) > _full(seeds, kept, axes):
+        return ("run",), np.arange(len(seeds))
+    kept.sort(key=lambda k: [repr(seeds[k].get(axis)).zfill(24) for axis in axes])
+    levels = tuple(DRAWN.get(axis, axis.removesuffix(".seed")) for axis in axes) or ("seed",)
+    return levels, np.array(kept).reshape([len(_values(seeds, axis, kept)) for axis in axes] or [1])
 
 
-def case_scalars(cells: list[Cell], metric: str, group: str | None = None) -> np.ndarray:
-    """As `case_means`, with metrics along time averaged over t: (replicates, [robots,] cases)."""
-    values = case_means(cells, metric, group)
-    if all(_table_with(cell, metric) == "per_step" for cell in cells):
-        defined = ~np.isnan(values).all(axis=tuple(range(values.ndim - 1)))
-        return values[..., defined].mean(axis=-1)
-    return values
+def _drawn_anew(seeds: list[dict[str, Any]]) -> list[str]:
+    """The axes that vary, of those that tell the same runs apart the first."""
+    axes: dict[tuple[int, ...], str] = {}
+    for axis in dict.fromkeys(name for found in seeds for name in found):
+        values = _values(seeds, axis)
+        axes.setdefault(tuple(values.index(found.get(axis)) for found in seeds), axis)
+    return [axis for places, axis in axes.items() if any(places)]
+
+
+def _values(seeds: list[dict[str, Any]], axis: str, kept: list[int] | None = None) -> list[Any]:
+    return list(dict.fromkeys(seeds[k].get(axis) for k in (range(len(seeds)) if kept is None else kept)))
+
+
+def _full(seeds: list[dict[str, Any]], kept: list[int], axes: list[str]) -> int:
+    """Number of entries of the grid that some runs span."""
+    return math.prod(len(_values(seeds, axis, kept)) for axis in axes)
+
+
+def _along_time(cell: Cell, metric: str) -> bool:
+    return _table_with(cell, metric) == "per_step"
 
 
 def _table_with(cell: Cell, metric: str) -> str | None:

@@ -6,26 +6,15 @@ A measure takes the evidence, the methods, the axes for their labels, and its ow
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from dadiff.reporting.aggregation import Evidence, Method, case_means, case_scalars, has_metric, pair, weights_for
+from dadiff.reporting.aggregation import FLOORS, Evidence, Method, Runs, has_metric, pair, pairs
 from dadiff.reporting.labels import axis_value, method_name, metric_name, with_interval
 from dadiff.reporting.selection import Selector
-from dadiff.reporting.sources import Cell
-from dadiff.reporting.statistics import (
-    Band,
-    Estimate,
-    interval,
-    mean,
-    plain_mean,
-    ratio,
-    resampled_means,
-    simultaneous_band,
-    widening,
-)
+from dadiff.reporting.statistics import Band, Draws, Estimate, mean, ratio, ratio_band
 
 
 @dataclass(frozen=True)
@@ -72,8 +61,7 @@ def level(evidence: Evidence, methods: list[Method], shown: list[str], *, metric
     """The mean of a metric."""
     out: list[Measured] = []
     for method in _usable(methods, shown, out, metric):
-        values = case_scalars(method.finished, metric)
-        estimate = mean(values, weights_for(values.shape))
+        estimate = mean(method.runs.scalars(metric), FLOORS.get(metric, 0))
         text = f"{metric_name(metric)} {_words(estimate)}{_lost(method)}"
         out.append(Measured(method_name(method.axes, shown), method.axes, estimate, text, method.keys))
     return out
@@ -86,8 +74,7 @@ def ratio_to(
     out: list[Measured] = []
     for method, other in _pairs(evidence, methods, shown, out, metric, against):
         own, theirs = pair(method, other)
-        values, baseline = case_scalars(own, metric), case_scalars(theirs, metric)
-        estimate = ratio(values, baseline, weights_for(values.shape))
+        estimate = ratio(own.scalars(metric), theirs.scalars(metric), FLOORS.get(metric, 0))
         text = (
             f"{metric_name(metric)} {_words(estimate)} times that of {_name_of(other, against)}{_lost(method, other)}"
         )
@@ -95,34 +82,41 @@ def ratio_to(
     return out
 
 
-def worst_difference(
+def at_every_time(
     evidence: Evidence, methods: list[Method], shown: list[str], *, metric: str, against: Selector
 ) -> list[Measured]:
-    """The largest over t of the paired difference along time, with its simultaneous band.
+    """The largest over t of the paired ratio along time, with its simultaneous band.
 
-    Its upper bound is below 0 exactly where the method is below the other at every t.
+    Its upper bound is below 1 exactly where the method is below the other at every t.
     """
     out: list[Measured] = []
     for method, other in _pairs(evidence, methods, shown, out, metric, against):
         own, theirs = pair(method, other)
-        values = case_means(own, metric) - case_means(theirs, metric)
-        values = values[..., ~np.isnan(values).all(axis=tuple(range(values.ndim - 1)))]
-        if not values.size:
+        found = ratio_band(own.curves(metric), theirs.curves(metric))
+        if np.isnan(found.value).all():
             out.append(_without(method, shown, f"{metric_name(metric)} is defined nowhere"))
             continue
-        band = simultaneous_band(values, weights_for(values.shape[:-1]))
-        estimate = Estimate(float(band.value.max()), float(band.low.max()), float(band.high.max()))
-        text = f"{metric_name(metric)} {_along(band)}, against {_name_of(other, against)}{_lost(method, other)}"
-        out.append(Measured(method_name(method.axes, shown), method.axes, estimate, text, _keys(own, theirs)))
+        estimate = Estimate(*(float(np.nanmax(part)) for part in (found.value, found.low, found.high)))
+        whole = _words(ratio(own.scalars(metric), theirs.scalars(metric)))
+        text = f"{metric_name(metric)} {whole} times that of {_name_of(other, against)}, {_along(found)}"
+        out.append(
+            Measured(
+                method_name(method.axes, shown),
+                method.axes,
+                estimate,
+                text + _lost(method, other),
+                _keys(own, theirs),
+            )
+        )
     return out
 
 
-def _along(band: Band) -> str:
-    """Where a band of differences is below and above 0, and the time with the highest upper bound."""
-    below, above, count = int((band.high < 0).sum()), int((band.low > 0).sum()), len(band.value)
-    worst = int(band.high.argmax())
-    at = _words(Estimate(float(band.value[worst]), float(band.low[worst]), float(band.high[worst])))
-    return f"lower at {below} and higher at {above} of {count} times (one band for all), at t = {worst} by {at}"
+def _along(found: Band) -> str:
+    """Where a band of ratios is below and above 1, and the time with the highest upper bound."""
+    below, above, count = (int(part.sum()) for part in (found.high < 1, found.low > 1, ~np.isnan(found.value)))
+    worst = int(np.nanargmax(np.nan_to_num(found.high, nan=-1)))
+    at = _words(Estimate(float(found.value[worst]), float(found.low[worst]), float(found.high[worst])))
+    return f"lower at {below} and higher at {above} of {count} times (one band for all), at t = {worst} {at} times"
 
 
 def dip(
@@ -131,11 +125,10 @@ def dip(
     """A metric at a time t over its mean at t - apart and t + apart, for each of the times."""
     out: list[Measured] = []
     for method in _usable(methods, shown, out, metric):
-        values = case_means(method.finished, metric)
-        weights = weights_for(values.shape[:-1])
-        for t in (t for t in times if t + apart < values.shape[-1]):
-            around = (values[..., t - apart] + values[..., t + apart]) / 2
-            estimate = ratio(values[..., t], around, weights)
+        draws = method.runs.curves(metric)
+        for t in (t for t in times if t + apart < draws.values.shape[-1]):
+            around = (draws.values[..., t - apart] + draws.values[..., t + apart]) / 2
+            estimate = ratio(replace(draws, values=draws.values[..., t]), replace(draws, values=around))
             text = f"error {_words(estimate)} times that {apart} steps before and after{_lost(method)}"
             label = f"{method_name(method.axes, shown)}, t = {t}"
             out.append(Measured(label, {**method.axes, "t": t}, estimate, text, method.keys))
@@ -149,14 +142,14 @@ def longest_over_shortest(
     out: list[Measured] = []
     rest = [name for name in shown if name != axis]
     for group in _groups(list(_usable(methods, shown, out, metric)), axis):
-        if len(group) < 2:
+        if len(group) < 2 or not pairs(group[-1], group[0]):
             continue
-        short, long = (case_scalars(m.finished, metric) for m in (group[0], group[-1]))
-        estimate = _unpaired_ratio(long, short)
+        long, short = pair(group[-1], group[0])
+        estimate = ratio(long.scalars(metric), short.scalars(metric))
         ends = " and ".join(axis_value(axis, m.axes[axis]) for m in (group[-1], group[0]))
         text = f"ratio of {metric_name(metric)} at {ends}: {_words(estimate)}{_lost(group[0], group[-1])}"
         axes = {name: value for name, value in group[0].axes.items() if name != axis}
-        out.append(Measured(method_name(axes, rest), axes, estimate, text, [k for m in group for k in m.keys]))
+        out.append(Measured(method_name(axes, rest), axes, estimate, text, _keys(long, short)))
     return out
 
 
@@ -166,14 +159,6 @@ def _groups(methods: list[Method], axis: str) -> list[list[Method]]:
         rest = repr(sorted((name, value) for name, value in method.axes.items() if name != axis))
         groups.setdefault(rest, []).append(method)
     return [sorted(group, key=lambda m: m.axes[axis]) for group in groups.values()]
-
-
-def _unpaired_ratio(values: np.ndarray, baseline: np.ndarray) -> Estimate:
-    """Of means, where numbers of replicates may differ; the cases are the same."""
-    drawn = [weights_for(x.shape) for x in (values, baseline)]
-    above, below = (resampled_means(x, weights) for x, weights in zip((values, baseline), drawn, strict=True))
-    point = float(plain_mean(values, drawn[0]) / plain_mean(baseline, drawn[1]))
-    return Estimate(point, *interval(above / below, point, max(drawn, key=widening), log=True))
 
 
 def share_grew(evidence: Evidence, methods: list[Method], shown: list[str], *, stage: str) -> list[Measured]:
@@ -201,11 +186,12 @@ def projection_share(evidence: Evidence, methods: list[Method], shown: list[str]
     out: list[Measured] = []
     for method in _usable(methods, shown, out, "projection_seconds"):
         parts = ("projection_seconds", "projection_calls", "sampling_seconds")
-        seconds, calls, total = (case_scalars(method.finished, name) for name in parts)
+        seconds, calls, total = (method.runs.scalars(name).values for name in parts)
         values = seconds * calls / total
-        estimate = mean(values, weights_for(values.shape)) if values.size > 1 else Estimate(*[values.item()] * 3)
+        single = values.size == 1
+        estimate = Estimate(*[values.item()] * 3) if single else mean(Draws(values, method.runs.levels))
         percent = Estimate(*(100 * x for x in (estimate.value, estimate.low, estimate.high)))
-        text = f"{_words(percent)} % of the sampling time{' of one run' * (values.size == 1)}{_lost(method)}"
+        text = f"{_words(percent)} % of the sampling time{' of one run' * single}{_lost(method)}"
         out.append(Measured(method_name(method.axes, shown), method.axes, estimate, text, method.keys))
     return out
 
@@ -228,14 +214,14 @@ def _without(method: Method, shown: list[str], why: str) -> Measured:
     return Measured(method_name(method.axes, shown), method.axes, None, why, method.keys)
 
 
-def _keys(*parts: list[Cell]) -> list[str]:
+def _keys(*parts: Runs) -> list[str]:
     """Of the runs that were compared, each once."""
-    return list(dict.fromkeys(cell.key for part in parts for cell in part))
+    return list(dict.fromkeys(key for part in parts for key in part.keys))
 
 
 def _lost(*methods: Method) -> str:
     """A warning that a number rests on a part of the replicates."""
-    parts = [f"{len(m.finished)} of {len(m.cells)} replicates: {m.outcome}" for m in methods if m.lost]
+    parts = [f"{len(m.keys)} of {len(m.cells)} runs: {m.outcome}" for m in methods if m.lost]
     return f" ({'; '.join(dict.fromkeys(parts))})" if parts else ""
 
 
@@ -252,7 +238,7 @@ MEASURES: dict[str, Measure] = {
     for measure in (
         level,
         ratio_to,
-        worst_difference,
+        at_every_time,
         dip,
         longest_over_shortest,
         share_grew,

@@ -93,7 +93,7 @@ def facts(evidence: Evidence, runs: list[str], *, intervals: bool = True) -> str
     text = f"{', '.join(filter(None, told))}."
     if not methods:
         return ""
-    return f"{text} {_covered(counts)}" if intervals else text
+    return f"{text} {_covered(methods)}" if intervals else text
 
 
 COUNTED = {"training seeds": "training seed", "seeds": "seed", "recordings": "recording", "robots": "robot",
@@ -106,15 +106,16 @@ def _several(name: str, values: set[int]) -> str:
     return f"{' or '.join(map(str, known))} {unit}" if known else ""
 
 
-def _covered(counts: list[dict[str, int]]) -> str:
-    most = {name: max(count.get(name, 0) for count in counts) for name in COUNTED}
-    seeds = max(most["training seeds"], most["seeds"])
-    many = most["recordings"] > seeds  # else they change with the seed
-    units = ["recordings"] * many + ["robots"] * (most["robots"] > 0) + ["cases"]
-    if seeds < 2:
-        kind = "training seed" if most["training seeds"] else "seed"
-        return f"95 % intervals, with one {kind}: they cover {_listed(units)} only."
-    return f"95 % intervals by a bootstrap over {_listed(['seeds', *units])}, widened for {seeds} seeds by Student's t."
+def _covered(methods: list[Method]) -> str:
+    """What the intervals cover: the levels that were drawn more than once."""
+    varied = {level for m in methods for level, size in zip(m.runs.levels, m.runs.cells.shape, strict=True) if size > 1}
+    robots = any("robots" in method.counts() for method in methods)
+    units = [*sorted(varied), *["robot"] * robots, "case"]
+    own = ", each run with cases of its own" if any(m.runs.nested for m in methods) else ""
+    if varied & {"seed", "training seed", "run"}:
+        return f"95 % intervals from an analysis of variance over {_listed([f'{unit}s' for unit in units])}{own}."
+    kind = "training seed" if any("training seeds" in method.counts() for method in methods) else "seed"
+    return f"95 % intervals, with one {kind}: they cover {_listed([f'{unit}s' for unit in units])} only."
 
 
 def _listed(words: list[str]) -> str:

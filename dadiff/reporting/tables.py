@@ -1,4 +1,4 @@
-"""Tables, a row a method: for each metric the mean, the interquartile mean and a paired comparison, with intervals."""
+"""Tables, a row a method: for each metric the mean and a paired comparison, with intervals."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ import io
 from dataclasses import dataclass
 from typing import Any
 
-from dadiff.reporting.aggregation import Evidence, Method, case_scalars, has_metric, pair, varying, weights_for
+from dadiff.reporting.aggregation import FLOORS, Evidence, Method, has_metric, pair, varying
 from dadiff.reporting.labels import method_name
 from dadiff.reporting.selection import Selector
-from dadiff.reporting.statistics import Estimate, difference, interquartile_mean, mean, ratio
+from dadiff.reporting.statistics import Estimate, difference, mean, ratio
 
 
 @dataclass(frozen=True)
@@ -18,7 +18,6 @@ class Value:
     """One metric of one method; the comparisons are paired, and None without a baseline."""
 
     mean: Estimate
-    middle: Estimate
     ratio: Estimate | None
     difference: Estimate | None
 
@@ -90,21 +89,18 @@ def _row(
 
 
 def _value(method: Method, other: Method | None, metric: str, group: str | None) -> Value:
-    values = case_scalars(method.finished, metric, group)
-    weights = weights_for(values.shape)
-    average, middle = mean(values, weights), interquartile_mean(values, weights)
+    average = mean(method.runs.scalars(metric, group), FLOORS.get(metric, 0))
     if other is None or other is method or not has_metric(other.finished, metric):
-        return Value(average, middle, None, None)
-    own, theirs = (case_scalars(cells, metric, group) for cells in pair(method, other))
-    weights = weights_for(own.shape)
-    return Value(average, middle, ratio(own, theirs, weights), difference(own, theirs, weights))
+        return Value(average, None, None)
+    own, theirs = (runs.scalars(metric, group) for runs in pair(method, other))
+    return Value(average, ratio(own, theirs, FLOORS.get(metric, 0)), difference(own, theirs))
 
 
 def to_csv(table: Table) -> str:
     """All numbers in full precision, a row a method."""
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
-    parts = ("mean", "middle", "ratio", "difference")
+    parts = ("mean", "ratio", "difference")
     names = [f"{metric}_{part}{end}" for metric in table.metrics for part in parts for end in ("", "_low", "_high")]
     writer.writerow(["method", "outcome", "counts", "runs", *names])
     for row in table.rows:

@@ -11,7 +11,7 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from dadiff.reporting.aggregation import Evidence, Method, case_scalars, has_metric, pair, varying, weights_for
+from dadiff.reporting.aggregation import FLOORS, Evidence, Method, has_metric, pair, varying
 from dadiff.reporting.figures.style import legend_below, letter, log_axis, look_of, looks_of, panels
 from dadiff.reporting.labels import axis_name, axis_value, method_name, metric_name
 from dadiff.reporting.selection import Selector
@@ -145,13 +145,11 @@ def _line(
 def _estimate(evidence: Evidence, method: Method, metric: str, baseline: Selector | None) -> Estimate:
     other = evidence.partner(method, baseline) if baseline else None
     if other is None:
-        values = case_scalars(method.finished, metric)
-        return mean(values, weights_for(values.shape))
+        return mean(method.runs.scalars(metric), FLOORS.get(metric, 0))
     own, theirs = pair(method, other)
-    values = case_scalars(own, metric)
-    return ratio(values, case_scalars(theirs, metric), weights_for(values.shape))
+    return ratio(own.scalars(metric), theirs.scalars(metric), FLOORS.get(metric, 0))
 
 
 def _level(method: Method, metric: str, shown: list[str]) -> Line:
-    values = case_scalars(method.finished, metric)
-    return Line(method_name(method.axes, shown), method.axes, [], [mean(values, weights_for(values.shape))])
+    estimate = mean(method.runs.scalars(metric), FLOORS.get(metric, 0))
+    return Line(method_name(method.axes, shown), method.axes, [], [estimate])

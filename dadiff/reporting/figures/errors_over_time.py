@@ -9,11 +9,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from dadiff.reporting.aggregation import Evidence, Method, case_means, varying, weights_for
+from dadiff.reporting.aggregation import Evidence, Method, varying
 from dadiff.reporting.figures.style import legend_below, letter, log_axis, looks_of, panels
 from dadiff.reporting.labels import axis_value, method_name, metric_name
 from dadiff.reporting.selection import Selector
-from dadiff.reporting.statistics import Band, simultaneous_band
+from dadiff.reporting.statistics import Band, band
 
 
 @dataclass(frozen=True)
@@ -95,6 +95,4 @@ def collect(
 
 
 def _curve(method: Method, metric: str, shown: list[str]) -> Curve:
-    values = case_means(method.finished, metric)
-    band = simultaneous_band(values, weights_for(values.shape[:-1]), log=True)
-    return Curve(method_name(method.axes, shown), method.axes, band)
+    return Curve(method_name(method.axes, shown), method.axes, band(method.runs.curves(metric)))

@@ -13,7 +13,7 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from dadiff.reporting.aggregation import Evidence, Method, case_scalars, weights_for
+from dadiff.reporting.aggregation import FLOORS, Evidence, Method
 from dadiff.reporting.figures.style import panels
 from dadiff.reporting.labels import axis_value, metric_name, number
 from dadiff.reporting.selection import Selector
@@ -94,5 +94,4 @@ def collect(evidence: Evidence, *, rows: str, columns: str, metric: str, cells: 
 def _entry(row: str, column: str, method: Method, metric: str) -> Entry:
     if not method.finished:
         return Entry(row, column, None, method.outcome)
-    values = case_scalars(method.finished, metric)
-    return Entry(row, column, mean(values, weights_for(values.shape)), "")
+    return Entry(row, column, mean(method.runs.scalars(metric), FLOORS.get(metric, 0)), "")

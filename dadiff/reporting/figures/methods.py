@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from dadiff.reporting.aggregation import Evidence, Method, case_scalars, varying, weights_for
+from dadiff.reporting.aggregation import FLOORS, Evidence, Method, varying
 from dadiff.reporting.figures.style import INK, letter, log_axis, look_of, panels
 from dadiff.reporting.labels import method_name, metric_name
 from dadiff.reporting.selection import Selector
@@ -117,6 +117,6 @@ def _row(method: Method, metric: str, shown: list[str], group: str | None) -> Ro
     label = method_name(method.axes, shown)
     if not method.finished:
         return Row(label, method.axes, None, np.empty(0), method.outcome)
-    values = case_scalars(method.finished, metric, group)
-    dots = np.nanmean(values, axis=-1) if values.ndim > 2 else values
-    return Row(label, method.axes, mean(values, weights_for(values.shape)), dots.ravel(), "")
+    draws = method.runs.scalars(metric, group)
+    dots = np.nanmean(draws.values, axis=-1) if "robot" in draws.levels else draws.values
+    return Row(label, method.axes, mean(draws, FLOORS.get(metric, 0)), dots.ravel(), "")

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from dadiff.reporting.aggregation import Evidence, Method, case_scalars, varying
+from dadiff.reporting.aggregation import Evidence, Method, varying
 from dadiff.reporting.figures.style import legend_below, letter, log_axis, looks_of, panels
 from dadiff.reporting.labels import method_name, metric_name
 from dadiff.reporting.selection import Selector
@@ -58,5 +58,6 @@ def collect(evidence: Evidence, *, metrics: list[str], cells: Selector) -> Robot
 
 def _points(method: Method, metrics: list[str], label: str) -> Points:
     distance = method.finished[0].table("robots")["distance"].to_numpy()
-    values = [case_scalars(method.finished, metric).mean(axis=(0, 2)) for metric in metrics]
-    return Points(label, method.axes, distance, np.stack(values))
+    values = [method.runs.scalars(metric).values for metric in metrics]
+    robots = [draws.mean(axis=(*range(draws.ndim - 2), -1)) for draws in values]
+    return Points(label, method.axes, distance, np.stack(robots))

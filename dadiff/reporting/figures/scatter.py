@@ -7,7 +7,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from dadiff.reporting.aggregation import Evidence, Method, case_scalars, has_metric, varying, weights_for
+from dadiff.reporting.aggregation import FLOORS, Evidence, Method, has_metric, varying
 from dadiff.reporting.figures.style import PANEL_WIDTH, legend_below, log_axis, looks_of, panels
 from dadiff.reporting.labels import method_name, metric_name
 from dadiff.reporting.selection import Selector
@@ -65,5 +65,4 @@ def collect(evidence: Evidence, *, x: str, y: str, cells: Selector, diagonal: bo
 
 
 def _mean(method: Method, metric: str) -> Estimate:
-    values = case_scalars(method.finished, metric)
-    return mean(values, weights_for(values.shape))
+    return mean(method.runs.scalars(metric), FLOORS.get(metric, 0))
