@@ -13,12 +13,12 @@ import time
 import numpy as np
 import torch
 
+from dadiff.behaviours import Known, Pin
 from dadiff.denoisers import MLP
 from dadiff.diffusion.chain import sample
 from dadiff.diffusion.enforcement import Normalised
 from dadiff.diffusion.samplers import DDIM
 from dadiff.diffusion.schedule import paper_linear
-from dadiff.projectors import Known
 from dadiff.randomness import torch_generator
 from dadiff.systems import DampedIntegrators
 from dadiff.tasks import LQR
@@ -37,7 +37,9 @@ class Fleet:
         self.shape = (robots, PLANS // robots, self.layout.size)
         x_init = rng.uniform(-1, 1, (*self.shape[:2], system.state_dim))
         begun = time.perf_counter()
-        self.projection = Known("fixed").fit(self.layout, system).projection(None, x_init).map(torch.as_tensor)
+        self.projection = (
+            Known("fixed").fit(self.layout, system).bind(pins=[Pin.initial_state(self.layout, x_init)], device="cpu")
+        )
         self.setup = time.perf_counter() - begun
         self.environment = torch.as_tensor(rng.uniform(-4, 4, (*self.shape[:2], 8)))
         condition = LQR().condition(system)

@@ -10,11 +10,11 @@ import time
 import torch
 
 from bench.training import LQR_LAYOUT, SCHEDULE, seconds
+from dadiff.behaviours import Known
 from dadiff.denoisers import EncoderDecoder
 from dadiff.diffusion.chain import sample
 from dadiff.diffusion.enforcement import Normalised
 from dadiff.diffusion.samplers import DDPM, skipped_weight
-from dadiff.projectors import Known
 from dadiff.randomness import numpy_generator, torch_generator
 from dadiff.systems import double_integrator
 from dadiff.tasks import LQR
@@ -33,7 +33,7 @@ def bench_projection(plans: int = PLANS) -> None:
     """The full DDPM chain of the paper's network (untrained, which takes as long), and the projections within it."""
     system = double_integrator()
     denoiser = EncoderDecoder().build(LQR_LAYOUT, LQR().condition(system), SCHEDULE, torch_generator(0, "bench"))
-    projection = Known().fit(LQR_LAYOUT, system).projection().map(torch.as_tensor)
+    projection = Known().fit(LQR_LAYOUT, system).bind()
     spent = [0.0]
 
     def project(tau: torch.Tensor) -> torch.Tensor:

@@ -15,10 +15,10 @@ import pytest
 import yaml
 from laws import CONF, composed
 
+from dadiff.behaviours import Hankel, Known
 from dadiff.config import assemble, build
 from dadiff.config.build import completed
 from dadiff.errors import ConfigError
-from dadiff.projectors import Hankel, Known
 
 
 @cache
@@ -50,14 +50,14 @@ def refused(make: Callable[[], dict[str, Any]]) -> str:
 
 
 def test_a_node_becomes_its_component():
-    node = {"_target_": "dadiff.projectors.Hankel", "allow_identity": True}
+    node = {"_target_": "dadiff.behaviours.Hankel", "allow_identity": True}
     assert build(node, "projector") == Hankel(allow_identity=True)
 
 
 def test_defaults_written_out_or_left_out_are_the_same():
     short, long = (
-        {"_target_": "dadiff.projectors.Known"},
-        {"_target_": "dadiff.projectors.Known", "initial_state": "free"},
+        {"_target_": "dadiff.behaviours.Known"},
+        {"_target_": "dadiff.behaviours.Known", "initial_state": "free"},
     )
     assert completed(short, "projector") == completed(long, "projector") == long
     assert build(short, "projector") == build(long, "projector") == Known()
@@ -113,7 +113,7 @@ def test_so_is_one_on_the_command_line(override, message):
 @pytest.mark.parametrize(
     ("target", "message"),
     [
-        ("dadiff.projectors.Knwon", "cannot be found"),
+        ("dadiff.behaviours.Knwon", "cannot be found"),
         ("dadiff.nowhere.Known", "cannot be found"),
         ("Known", "expected the dotted name of a class or function"),
         ("subprocess.run", "lies outside dadiff and is not built; to trust its package add components=[subprocess]"),
@@ -137,9 +137,9 @@ class Own:
     """A component of the user's own package."""
 
     strength: float = 1.0
-    needs: ClassVar[str | None] = None
+    needs: ClassVar[frozenset[str]] = frozenset()
 
-    def fit(self, layout, system=None, recording=None):
+    def fit(self, layout, system=None, recording=None, demonstrations=None):
         """Nothing."""
 
 

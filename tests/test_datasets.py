@@ -9,15 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dadiff.behaviours import Hankel, Known, compared
 from dadiff.datasets import Generated, NpzRecordings, NpzTrajectories
 from dadiff.datasets.cached import load_data, save_data
 from dadiff.datasets.files import read_array
 from dadiff.errors import ConfigError, DataError
-from dadiff.projectors import Hankel, Known
 from dadiff.systems import GaussianExcitation, LinearSystem, double_integrator
 from dadiff.tasks import LQR, Demonstrations
 from dadiff.trajectory import Channel, Layout
-from dadiff.trajectory.subspace import largest_angle
 
 SYSTEM, TASK = double_integrator(), LQR(horizon=6)
 
@@ -244,7 +243,7 @@ def test_own_recordings_teach_the_dynamics(tmp_path, system):
     assert (recording.count, recording.length) == (3, 60)
     layout = system.layout(6)
     learned, known = Hankel().fit(layout, recording=recording), Known().fit(layout, system)
-    assert largest_angle(learned.basis, known.basis) < 1e-10
+    assert compared(learned, known)["principal_angle"] < 1e-10
 
 
 def test_recordings_of_other_lengths_are_named(tmp_path):

@@ -9,12 +9,12 @@ import pytest
 import torch
 from laws import SYSTEMS, component, presets, tolerance, variants
 
+from dadiff.behaviours import Known, pins
 from dadiff.denoisers.exact import ExactDenoiser
 from dadiff.diffusion.chain import Samples, sample
 from dadiff.diffusion.enforcement import CleanEstimate, Convex, Literally, Never, Normalised, PostHoc
 from dadiff.diffusion.samplers import DDIM, DDPM
 from dadiff.diffusion.schedule import Schedule, cosine, ddpm_linear, paper_linear
-from dadiff.projectors import Known
 from dadiff.randomness import torch_generator
 from dadiff.tasks import LQR
 from dadiff.trajectory.coordinates import physical
@@ -54,7 +54,8 @@ X_INIT = np.linspace(-1, 1, 2 * SYSTEM.state_dim)[: SYSTEM.state_dim].repeat(PLA
 
 
 def projection(initial_state="free"):
-    return Known(initial_state).fit(LAYOUT, SYSTEM).projection(x_init=X_INIT).map(torch.as_tensor)
+    known = Known(initial_state)
+    return known.fit(LAYOUT, SYSTEM).bind(pins=pins(known, LAYOUT, X_INIT))
 
 
 def draw(enforcement, project, sampler=None, schedule: Schedule | None = None, **options) -> Samples:

@@ -10,6 +10,7 @@ import torch
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 
+from dadiff.behaviours import HankelLowRank, Identified, Known, Pin, pins
 from dadiff.config.composed import plain
 from dadiff.config.settings import GROUPS
 from dadiff.datasets import Generated, NpzRecordings, NpzTrajectories
@@ -17,7 +18,6 @@ from dadiff.denoisers import RecordingMLP
 from dadiff.diffusion.schedule import paper_linear
 from dadiff.errors import ConfigError, DataError, InfeasibleError, ShapeError
 from dadiff.launching import register
-from dadiff.projectors import HankelLowRank, Identified, Known
 from dadiff.randomness import torch_generator
 from dadiff.running.assembly import Experiment
 from dadiff.running.experiment import execute
@@ -83,10 +83,10 @@ class TestFamilies:
         plans, x_init = rng.standard_normal((4, 7, layout.size)), rng.standard_normal((4, 7, layout.state_dim))
         recording = GaussianExcitation(length=60, process_noise=0.01).record(robots)
         for projector in (Known(), Known("fixed"), HankelLowRank("fixed"), Identified()):
-            together = projector.fit(layout, robots, recording).projection(None, x_init)(plans)
+            together = projector.fit(layout, robots, recording).bind(None, pins(projector, layout, x_init))(plans)
             for k in range(4):
                 alone = recording.__class__(recording.states[[k]], recording.inputs[[k]])
-                one = projector.fit(layout, robots.take([k]), alone).projection(None, x_init[[k]])
+                one = projector.fit(layout, robots.take([k]), alone).bind(None, pins(projector, layout, x_init[[k]]))
                 np.testing.assert_allclose(one(plans[[k]])[0], together[k], atol=1e-9)
 
     def test_references_are_optimal_and_demonstrations_obey_each_robots_dynamics(self, family, rng):
@@ -95,7 +95,7 @@ class TestFamilies:
         robots = task.target(quiet)
         cases = task.cases(robots, 4, rng)
         layout = robots.layout(task.horizon)
-        known = Known("fixed").fit(layout, robots).projection(None, cases.x_init)
+        known = Known().fit(layout, robots).bind(None, [Pin.initial_state(layout, cases.x_init)])
         np.testing.assert_allclose(known(cases.reference), cases.reference, atol=1e-9)
         nearby = known(cases.reference + 0.01 * rng.standard_normal(cases.reference.shape))
         assert (task.score(robots, cases, nearby[:, :, None], nearby[:, :, None]).per_plan["cost_ratio"] >= 1).all()
@@ -238,7 +238,7 @@ class TestBadInput:
 
     def test_a_projector_of_other_robots(self, rng):
         robots = self.family.inside(3, rng)
-        projection = Known().fit(robots.layout(5), robots).projection()
+        projection = Known().fit(robots.layout(5), robots).bind()
         with pytest.raises(ShapeError, match="made for trajectories of shape"):
             projection(np.zeros((6, 4, robots.layout(5).size)))
         with pytest.raises(ShapeError, match="made for trajectories of shape"):

@@ -82,7 +82,7 @@ def test_light_rooms_load_nothing_heavy():
         "systems",
         "experts.lqr",
         "tasks",
-        "projectors",
+        "behaviours",
         "datasets",
         "diffusion.samplers",
         "evaluation",

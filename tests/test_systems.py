@@ -7,8 +7,8 @@ import pytest
 from laws import fleet, members, tolerance
 from scipy.linalg import expm
 
+from dadiff.behaviours import Transitions, least_squares
 from dadiff.errors import ConfigError, ExcitationError, ShapeError
-from dadiff.projectors import identify
 from dadiff.systems import GaussianExcitation, LinearSystem, Recording, double_integrator
 
 
@@ -105,9 +105,14 @@ def test_a_recording_has_one_state_more_than_inputs(states):
         Recording(np.zeros(states), np.zeros((2, 10, 2)))
 
 
+def learned(recording: Recording, offset="none", known=None):
+    return least_squares(Transitions.of(recording.states, recording.inputs), offset, known)
+
+
 def test_least_squares_finds_A_and_B(system):
     recording = GaussianExcitation(length=60, process_noise=0.0, count=2).record(system)
-    A, B = identify(recording)
+    estimate = learned(recording)
+    A, B = estimate.A, estimate.B
     atol = tolerance(size=60, conditioning=1e3)
     np.testing.assert_allclose(A, system.A, atol=atol)
     np.testing.assert_allclose(B, system.B, atol=atol)
@@ -115,7 +120,7 @@ def test_least_squares_finds_A_and_B(system):
 
 def test_least_squares_comes_closer_with_length():
     system = double_integrator(process_noise=0.05)
-    errors = [np.abs(identify(GaussianExcitation(length=S).record(system))[0] - system.A).max() for S in (30, 3000)]
+    errors = [np.abs(learned(GaussianExcitation(length=S).record(system)).A - system.A).max() for S in (30, 3000)]
     assert errors[1] < errors[0] / 3
 
 
@@ -123,4 +128,4 @@ def test_recordings_under_feedback_cannot_identify(system):
     x = GaussianExcitation(length=60, process_noise=0.01).record(system).states
     gain = np.ones((system.input_dim, system.state_dim))
     with pytest.raises(ExcitationError, match=rf"span {system.state_dim} dimensions, n \+ m = "):
-        identify(Recording(x, x[:, :-1] @ gain.T))
+        learned(Recording(x, x[:, :-1] @ gain.T))

@@ -14,6 +14,7 @@ import pytest
 import torch
 from laws import SYSTEMS
 
+from dadiff.behaviours import Known
 from dadiff.denoisers.exact import ExactDenoiser
 from dadiff.diffusion.chain import Samples, sample
 from dadiff.diffusion.enforcement import Literally, Never, Normalised
@@ -21,7 +22,6 @@ from dadiff.diffusion.samplers import DDPM
 from dadiff.diffusion.schedule import paper_linear
 from dadiff.evaluation.mahalanobis import MahalanobisDistance
 from dadiff.evaluation.records import ChainRecorder
-from dadiff.projectors import Known
 from dadiff.randomness import numpy_generator, torch_generator
 from dadiff.tasks import LQR
 from dadiff.trajectory.coordinates import physical
@@ -79,7 +79,7 @@ def chain(enforcement) -> tuple[Samples, pd.DataFrame]:
         torch.as_tensor(cases.environment),
         (PLANS, LAYOUT.size),
         torch_generator(0, "test"),
-        Known().fit(LAYOUT, SYSTEM).projection().map(torch.as_tensor),
+        Known().fit(LAYOUT, SYSTEM).bind(),
         enforcement,
         recorder,
     )

@@ -24,7 +24,7 @@ PROTOCOLS: Mapping[str, tuple[str, ...]] = {
     "denoiser": ("dadiff.denoisers.recipes.Recipe", "dadiff.denoisers.recipes.ExactRecipe"),
     "training": ("dadiff.denoisers.training.Training",),
     "sampler": ("dadiff.diffusion.samplers.Sampler",),
-    "projector": ("dadiff.projectors.Projector",),
+    "projector": ("dadiff.behaviours.Projector",),
     "enforcement": ("dadiff.diffusion.enforcement.Enforcement",),
     "evaluation": ("dadiff.evaluation.Evaluation",),
     "tracking": ("dadiff.tracking.Tracking",),

@@ -15,20 +15,19 @@ import numpy as np
 import torch
 import yaml
 
+from dadiff.behaviours import Known, Projection, compared, pins
 from dadiff.diffusion.chain import Samples, sample
 from dadiff.diffusion.enforcement import Enforcement
 from dadiff.errors import NotApplicableError
 from dadiff.evaluation import replay, tracking_errors
 from dadiff.evaluation.mahalanobis import MahalanobisDistance
 from dadiff.evaluation.records import ChainRecorder, Snapshots, headline, merged, tables
-from dadiff.projectors import AdmissibleSet, Known, Projection
 from dadiff.randomness import numpy_generator, torch_generator
 from dadiff.running.assembly import Experiment
 from dadiff.running.provenance import record_of
 from dadiff.store import StoredRun
 from dadiff.systems import LinearSystem, Robots
 from dadiff.tasks import Scores
-from dadiff.trajectory.subspace import largest_angle, projector_distance
 
 EXAMPLE_ROBOTS = 3
 
@@ -96,18 +95,27 @@ def projection_of(experiment: Experiment, x_init: np.ndarray) -> tuple[Projectio
         x_init: (*robots, plans, n).
     """
     projector, layout = experiment.parts["projector"], experiment.layout
-    recording = experiment.parts["recording"].record(experiment.target) if projector.needs == "recording" else None
+    sources = _sources(experiment)
     start = time.perf_counter()
-    fitted = projector.fit(layout, system=experiment.target, recording=recording)
+    fitted = projector.fit(layout, system=experiment.target, **sources)
     if fitted is None:
         return None, {}
-    projection = fitted.projection(experiment.coordinates, x_init)
+    held = pins(projector, layout, x_init)
+    projection = fitted.bind(experiment.coordinates, held, experiment.device)
     measures = {"projector_setup_seconds": time.perf_counter() - start, **fitted.notes}
-    if isinstance(fitted, AdmissibleSet) and recording is not None:
-        truth = Known(projector.initial_state).fit(layout, experiment.target).basis
-        measures["principal_angle"] = float(np.mean(largest_angle(fitted.basis, truth)))
-        measures["projector_distance"] = float(np.mean(projector_distance(fitted.basis, truth)))
+    if sources:
+        measures |= compared(fitted, Known().fit(layout, experiment.target), held)
     return projection, measures
+
+
+def _sources(experiment: Experiment) -> dict[str, Any]:
+    """What the projector learns from, besides the system."""
+    needs, sources = experiment.parts["projector"].needs, {}
+    if "recording" in needs:
+        sources["recording"] = experiment.parts["recording"].record(experiment.target)
+    if "demonstrations" in needs:
+        sources["demonstrations"] = experiment.demonstrations.trajectories
+    return sources
 
 
 def draw_plans(experiment: Experiment) -> Plans:
@@ -118,7 +126,7 @@ def draw_plans(experiment: Experiment) -> Plans:
     projection, measures = projection_of(experiment, np.repeat(cases.x_init, evaluation.samples, axis=-2))
     _check_enforcement(parts["enforcement"], projection)
     device = experiment.device
-    project = Timed(projection.map(lambda a: torch.as_tensor(a, device=device)), device) if projection else None
+    project = Timed(projection, device) if projection else None
     denoiser = experiment.denoiser  # after the projection, which may refuse what it is given
     chain, snapshots = _observers(experiment, environment)
     watch = Timed(lambda *seen: [observe(*seen) for observe in (chain, snapshots) if observe])
@@ -139,7 +147,7 @@ def draw_plans(experiment: Experiment) -> Plans:
 
 
 def _check_enforcement(enforcement: Enforcement, projection: Projection | None) -> None:
-    if projection is not None and np.any(projection.offset) and not enforcement.affine:
+    if projection is not None and projection.affine and not enforcement.affine:
         raise NotApplicableError(
             "enforcement: literal scales the sample, which is meaningless for an affine set (x(0) held, or coordinates "
             "with a mean); use projector.initial_state=free and coordinates=physical, or another enforcement"

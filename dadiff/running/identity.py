@@ -14,6 +14,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from dadiff.behaviours import NoProjector
 from dadiff.config.build import TARGET, defaults, resolve
 from dadiff.config.settings import GROUPS, Parts, assemble, complete
 
@@ -113,9 +114,9 @@ def _groups_that_matter(parts: Parts) -> list[str]:
     ignored = {"tracking"}
     if not parts["denoiser"].trainable:
         ignored.add("training")
-    if parts["projector"].needs != "recording":
+    if "recording" not in parts["projector"].needs:
         ignored.add("recording")
-    if parts["projector"].needs is None:
+    if isinstance(parts["projector"], NoProjector):
         ignored.add("enforcement")
     return [group for group in GROUPS if group not in ignored]
 

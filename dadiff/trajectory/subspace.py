@@ -46,3 +46,20 @@ def projector_distance(U: np.ndarray, V: np.ndarray) -> np.ndarray:
     overlap = U.swapaxes(-1, -2) @ V
     outside = [U - V @ overlap.swapaxes(-1, -2), V - U @ overlap]
     return np.sqrt(sum(np.square(part).sum(axis=(-2, -1)) for part in outside) / (2 * V.shape[-1]))
+
+
+def semidefinite_root(M: np.ndarray) -> np.ndarray:
+    """L with L L' = M (..., d, d), symmetric positive semidefinite; what rounding makes negative counts as 0."""
+    values, vectors = np.linalg.eigh(M)
+    return vectors * np.sqrt(np.maximum(values, 0))[..., None, :]
+
+
+def semidefinite_inverse(M: np.ndarray) -> np.ndarray:
+    """M^+ of a symmetric positive semidefinite M (..., d, d), after its rows are scaled to a diagonal of 1.
+
+    Scaling makes the one rank rule independent of units.
+    """
+    size = np.sqrt(np.einsum("...ii->...i", M))
+    scale = np.where(size > 0, size, 1.0)
+    across = scale[..., :, None] * scale[..., None, :]
+    return np.linalg.pinv(M / across, rcond=M.shape[-1] * np.finfo(np.float64).eps, hermitian=True) / across

@@ -1,0 +1,43 @@
+"""Behaviours: the sets of admissible trajectories, what they are learned from, and the projections onto them."""
+
+from dadiff.behaviours.components import (
+    Hankel,
+    HankelLowRank,
+    Identified,
+    Inpainting,
+    Known,
+    NoProjector,
+    Projector,
+    RolloutProjector,
+    pins,
+)
+from dadiff.behaviours.least_squares import Estimate, Transitions, least_squares
+from dadiff.behaviours.pins import Pin
+from dadiff.behaviours.projection import Projection, ProjectionInfo
+from dadiff.behaviours.sets import Dynamics, Everything, Rollout, Span, TrajectorySet, compared
+from dadiff.behaviours.stages import Stages
+
+__all__ = [
+    "Dynamics",
+    "Estimate",
+    "Everything",
+    "Hankel",
+    "HankelLowRank",
+    "Identified",
+    "Inpainting",
+    "Known",
+    "NoProjector",
+    "Pin",
+    "Projection",
+    "ProjectionInfo",
+    "Projector",
+    "Rollout",
+    "RolloutProjector",
+    "Span",
+    "Stages",
+    "TrajectorySet",
+    "Transitions",
+    "compared",
+    "least_squares",
+    "pins",
+]

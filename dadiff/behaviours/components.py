@@ -1,0 +1,296 @@
+"""The projectors: what is known of the dynamics, and the set of trajectories that follows from it.
+
+Each is a dataclass with `fit`, which uses what its `needs` names, and a yaml in `conf/projector/`. `fit` returns the
+set in physical units; see `dadiff.behaviours.sets`. `initial_state` says whether x(0) is pinned at x_init.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar, Literal, Protocol, TypeVar
+
+import numpy as np
+
+from dadiff.behaviours.least_squares import Offset, Transitions, least_squares
+from dadiff.behaviours.pins import Pin
+from dadiff.behaviours.sets import Dynamics, Everything, InitialState, Rollout, Span, TrajectorySet
+from dadiff.behaviours.stages import stages_of
+from dadiff.errors import ConfigError, ExcitationError
+from dadiff.systems import LinearSystem, Recording
+from dadiff.trajectory.hankel import identity_length, trajectory_matrix
+from dadiff.trajectory.layout import TrajectoryLayout
+from dadiff.trajectory.subspace import numerical_rank, rank_tolerance
+
+Given = TypeVar("Given")
+LearnFrom = Literal["recording", "demonstrations", "both"]
+
+NOTHING: frozenset[str] = frozenset()
+SYSTEM, RECORDING = frozenset({"system"}), frozenset({"recording"})
+
+
+class Projector(Protocol):
+    """Finds a set of trajectories; `needs` names what it finds it from: system, recording, demonstrations."""
+
+    @property
+    def needs(self) -> frozenset[str]:
+        """What `fit` must be given."""
+        ...
+
+    def fit(
+        self,
+        layout: TrajectoryLayout,
+        system: LinearSystem | None = None,
+        recording: Recording | None = None,
+        demonstrations: np.ndarray | None = None,
+    ) -> TrajectorySet | None:
+        """The set, or None where nothing is projected.
+
+        Args:
+            demonstrations: trajectories (N, d), in physical units.
+        """
+        ...
+
+
+def pins(projector: Projector, layout: TrajectoryLayout, x_init: np.ndarray) -> tuple[Pin, ...]:
+    """What a projector holds of each plan: x(0) = x_init (*robots, plans..., n), where its initial_state is `fixed`."""
+    fixed = getattr(projector, "initial_state", "free") == "fixed"
+    return (Pin.initial_state(layout, x_init),) if fixed else ()
+
+
+@dataclass(frozen=True)
+class NoProjector:
+    """Vanilla diffusion: nothing is projected."""
+
+    needs: ClassVar[frozenset[str]] = NOTHING
+
+    def fit(
+        self,
+        layout: TrajectoryLayout,
+        system: LinearSystem | None = None,
+        recording: Recording | None = None,
+        demonstrations: np.ndarray | None = None,
+    ) -> None:
+        """Nothing to fit."""
+
+
+@dataclass(frozen=True)
+class Inpainting:
+    """Nothing is known of the dynamics; only x(0) = x_init is held, as Diffuser does (Janner et al. 2022)."""
+
+    needs: ClassVar[frozenset[str]] = NOTHING
+    initial_state: ClassVar[InitialState] = "fixed"
+
+    def fit(
+        self,
+        layout: TrajectoryLayout,
+        system: LinearSystem | None = None,
+        recording: Recording | None = None,
+        demonstrations: np.ndarray | None = None,
+    ) -> Everything:
+        """All trajectories."""
+        return Everything(layout, notes={"rank": layout.size})
+
+
+@dataclass(frozen=True)
+class Known:
+    """P = F F† from known dynamics, eq. (5).
+
+    Args:
+        initial_state: `fixed` projects onto the trajectories with x(0) = x_init.
+    """
+
+    initial_state: InitialState = "free"
+    needs: ClassVar[frozenset[str]] = SYSTEM
+
+    def fit(
+        self,
+        layout: TrajectoryLayout,
+        system: LinearSystem | None = None,
+        recording: Recording | None = None,
+        demonstrations: np.ndarray | None = None,
+    ) -> Dynamics:
+        """The trajectories of the system."""
+        system = _required(system, "known", "system")
+        return Dynamics(layout, stages_of(system, layout.horizon), notes={"rank": layout.rank})
+
+
+@dataclass(frozen=True)
+class Hankel:
+    """P = H H† with H = [H_{T+1}(x); H_T(u)], literally eq. (11).
+
+    Process noise gives every column a direction of its own; from d columns on H H† is the identity and the
+    projector does nothing. That is refused unless `allow_identity`.
+    """
+
+    initial_state: InitialState = "free"
+    allow_identity: bool = False
+    needs: ClassVar[frozenset[str]] = RECORDING
+
+    def fit(
+        self,
+        layout: TrajectoryLayout,
+        system: LinearSystem | None = None,
+        recording: Recording | None = None,
+        demonstrations: np.ndarray | None = None,
+    ) -> Span:
+        """The image of H."""
+        recording = _required(recording, "hankel", "recording")
+        U, s, rank = _decompose(recording, layout)
+        if rank == layout.size and not self.allow_identity:
+            raise ExcitationError(
+                f"projector hankel: {recording.count} x S = {recording.length} noisy columns span all d = "
+                f"{layout.size} dimensions, so H H† is the identity and projects nothing; use hankel_lowrank, "
+                f"S < {identity_length(layout, recording.count)}, or projector.allow_identity=true"
+            )
+        return Span(layout, U[..., :rank], notes=_notes(s, rank))
+
+
+@dataclass(frozen=True)
+class HankelLowRank:
+    """P = U U' with U the n + mT leading left singular vectors of the stacked Hankel matrix.
+
+    The stack is truncated, not H(u) alone: under process noise its best approximation of the dynamics' rank.
+    """
+
+    initial_state: InitialState = "free"
+    needs: ClassVar[frozenset[str]] = RECORDING
+
+    def fit(
+        self,
+        layout: TrajectoryLayout,
+        system: LinearSystem | None = None,
+        recording: Recording | None = None,
+        demonstrations: np.ndarray | None = None,
+    ) -> Span:
+        """The leading n + mT directions of H."""
+        recording = _required(recording, "hankel_lowrank", "recording")
+        U, s, _ = _decompose(recording, layout)
+        return Span(layout, U[..., : layout.rank], notes=_notes(s, layout.rank))
+
+
+@dataclass(frozen=True)
+class Identified:
+    """P = F F† with dynamics estimated by least squares: min sum_t |x(t+1) - A x(t) - B u(t) - c|^2.
+
+    Args:
+        initial_state: `fixed` holds x(0) = x_init.
+        learn_from: transitions of the `recording`, of the `demonstrations`, or of both: they obey the same dynamics.
+        offset: c is `none` (0), `estimated`, or `known` from the system.
+    """
+
+    initial_state: InitialState = "free"
+    learn_from: LearnFrom = "recording"
+    offset: Offset = "none"
+
+    @property
+    def needs(self) -> frozenset[str]:
+        """What it learns from, and the system whose offset is known."""
+        sources = {"recording", "demonstrations"} if self.learn_from == "both" else {self.learn_from}
+        return frozenset(sources | ({"system"} if self.offset == "known" else set()))
+
+    def fit(
+        self,
+        layout: TrajectoryLayout,
+        system: LinearSystem | None = None,
+        recording: Recording | None = None,
+        demonstrations: np.ndarray | None = None,
+    ) -> Dynamics:
+        """The trajectories of the estimated dynamics."""
+        data = transitions(self, layout, system, recording, demonstrations)
+        estimate = least_squares(data, self.offset, known_offset(self, system))
+        return Dynamics(layout, estimate.stages(layout.horizon), notes={"rank": layout.rank})
+
+
+@dataclass(frozen=True)
+class RolloutProjector:
+    """Keeps the planned inputs and recomputes the states from x_init with known dynamics."""
+
+    needs: ClassVar[frozenset[str]] = SYSTEM
+    initial_state: ClassVar[InitialState] = "fixed"
+
+    def fit(
+        self,
+        layout: TrajectoryLayout,
+        system: LinearSystem | None = None,
+        recording: Recording | None = None,
+        demonstrations: np.ndarray | None = None,
+    ) -> Rollout:
+        """The map u -> F [x_init; u]."""
+        system = _required(system, "rollout", "system")
+        return Rollout(layout, stages_of(system, layout.horizon), notes={"rank": layout.rank - layout.state_dim})
+
+
+def transitions(
+    projector: Identified,
+    layout: TrajectoryLayout,
+    system: LinearSystem | None,
+    recording: Recording | None,
+    demonstrations: np.ndarray | None,
+) -> Transitions:
+    """What a projector learns dynamics from.
+
+    Raises:
+        ConfigError: if a source is missing, or the demonstrations are of many robots.
+    """
+    found = []
+    if "recording" in projector.needs:
+        recording = _required(recording, "identified", "recording")
+        found.append(Transitions.of(recording.states, recording.inputs))
+    if "demonstrations" in projector.needs:
+        trajectories = _required(demonstrations, "identified", "dataset")
+        robots = found[0].x.shape[:-2] if found else () if system is None else system.robots
+        if robots not in ((), (1,)):
+            raise ConfigError(
+                f"projector: the demonstrations are of many robots, and say nothing of any one of the {robots[0]} that "
+                "are planned for; use projector.learn_from=recording"
+            )
+        states, inputs = layout.split(trajectories)
+        found.append(Transitions.of(states.reshape(*robots, *states.shape), inputs.reshape(*robots, *inputs.shape)))
+    return found[0] if len(found) == 1 else found[0] + found[1]
+
+
+def known_offset(projector: Identified, system: LinearSystem | None) -> np.ndarray | None:
+    """c of the system (*robots, n), where the projector is told it."""
+    if projector.offset != "known":
+        return None
+    return stages_of(_required(system, "identified", "system"), 1).c[..., 0, :]
+
+
+def _decompose(recording: Recording, layout: TrajectoryLayout) -> tuple[np.ndarray, np.ndarray, int]:
+    """Left singular vectors, singular values and rank of the stack H.
+
+    Raises:
+        ExcitationError: if x(0) and u(0:T-1) of the windows do not span n + mT dimensions (Willems' condition, which
+            noise cannot feign: under feedback alone u(0) follows from x(0)), or the rank differs between robots.
+    """
+    H = trajectory_matrix(recording.states, recording.inputs, layout)
+    sources = np.concatenate([H[..., layout.initial_state, :], H[..., layout.all_inputs, :]], axis=-2)
+    if (found := numerical_rank(sources)) < layout.rank:
+        raise ExcitationError(
+            f"recording: x(0) and u(0:T-1) of its windows have rank {found}, n + mT = {layout.rank} are needed: the "
+            "inputs do not excite the system; record with inputs that vary independently of the state (not under "
+            "feedback alone)"
+        )
+    U, s, _ = np.linalg.svd(H, full_matrices=False)
+    ranks = (s > rank_tolerance(s, H.shape)).sum(axis=-1)
+    rank = int(ranks.min())
+    if rank < ranks.max():
+        raise ExcitationError(
+            f"recording: the robots' Hankel matrices have ranks from {rank} to {int(ranks.max())}; "
+            "give every robot a recording of the same length and noise"
+        )
+    return U, s, rank
+
+
+def _notes(s: np.ndarray, rank: int) -> dict[str, float]:
+    """Rank, and the gap s_r / s_{r+1} behind it (inf where nothing follows); of a fleet, the smallest gap."""
+    if rank >= s.shape[-1]:
+        return {"rank": rank, "singular_value_gap": float("inf")}
+    with np.errstate(divide="ignore"):
+        return {"rank": rank, "singular_value_gap": float((s[..., rank - 1] / s[..., rank]).min())}
+
+
+def _required(value: Given | None, projector: str, what: str) -> Given:
+    if value is None:
+        raise ConfigError(f"projector {projector} needs a {what}, and none is given; choose one with {what}=...")
+    return value

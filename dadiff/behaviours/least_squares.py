@@ -1,0 +1,103 @@
+"""Dynamics from data by least squares: min sum_t |x(t+1) - A x(t) - B u(t) - c|^2.
+
+With phi = [x; u; 1] the estimate's error has covariance (Phi' Phi)^-1 (x) sigma^2, so that one knows which directions
+are known how well.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from dadiff.behaviours.stages import Stages, transposed
+from dadiff.errors import ExcitationError
+from dadiff.trajectory.subspace import numerical_rank
+
+Offset = Literal["none", "estimated", "known"]
+
+
+@dataclass(frozen=True)
+class Transitions:
+    """(x(t), u(t)) -> x(t+1), in no order.
+
+    Args:
+        x, following: (*robots, count, n).
+        u: (*robots, count, m).
+    """
+
+    x: np.ndarray = field(repr=False)
+    u: np.ndarray = field(repr=False)
+    following: np.ndarray = field(repr=False)
+
+    @classmethod
+    def of(cls, states: np.ndarray, inputs: np.ndarray) -> Transitions:
+        """All transitions of experiments: states (*robots, count, S+1, n), inputs (*robots, count, S, m)."""
+        return cls(_joined(states[..., :-1, :]), _joined(inputs), _joined(states[..., 1:, :]))
+
+    def __add__(self, other: Transitions) -> Transitions:
+        """Both together."""
+        pairs = [(self.x, other.x), (self.u, other.u), (self.following, other.following)]
+        return Transitions(*(np.concatenate(pair, axis=-2) for pair in pairs))
+
+
+def _joined(array: np.ndarray) -> np.ndarray:
+    return array.reshape(*array.shape[:-3], -1, array.shape[-1])
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """(A, B, c), and how sure one is of them.
+
+    Args:
+        A, B, c: (*robots, n, n), (*robots, n, m), (*robots, n).
+        spread: (Phi' Phi)^-1 of shape (*robots, p, p), with p = n + m, and one more where c was estimated, too.
+        noise: variance of the residual of each state, (*robots, n), with p degrees of freedom taken off.
+    """
+
+    A: np.ndarray = field(repr=False)
+    B: np.ndarray = field(repr=False)
+    c: np.ndarray = field(repr=False)
+    spread: np.ndarray = field(repr=False)
+    noise: np.ndarray = field(repr=False)
+
+    def stages(self, horizon: int) -> Stages:
+        """The same dynamics at every stage."""
+        return Stages.constant(self.A, self.B, self.c, horizon)
+
+
+def least_squares(data: Transitions, offset: Offset = "none", known: np.ndarray | None = None) -> Estimate:
+    """The estimate from transitions.
+
+    Args:
+        offset: `none` for c = 0, `estimated`, or `known`.
+        known: c of shape (*robots, n), where it is known.
+
+    Raises:
+        ExcitationError: if [x(t); u(t)], and 1 where c is estimated, do not span all their dimensions.
+    """
+    n, m = data.x.shape[-1], data.u.shape[-1]
+    given = np.zeros((*data.x.shape[:-2], n)) if known is None else known
+    ones = [np.ones((*data.x.shape[:-1], 1))] if offset == "estimated" else []
+    Phi = np.concatenate([data.x, data.u, *ones], axis=-1)
+    _check_rank(Phi, n + m)
+    Q, R = np.linalg.qr(Phi)
+    target = data.following - given[..., None, :]
+    theta = transposed(np.linalg.solve(R, transposed(Q) @ target))
+    residual = target - Phi @ transposed(theta)
+    freedom = max(Phi.shape[-2] - Phi.shape[-1], 1)
+    inverse = np.linalg.inv(R)
+    return Estimate(
+        theta[..., :n], theta[..., n : n + m], theta[..., n + m] if ones else given,
+        inverse @ transposed(inverse), np.square(residual).sum(axis=-2) / freedom,
+    )  # fmt: skip
+
+
+def _check_rank(Phi: np.ndarray, needed: int) -> None:
+    if (rank := numerical_rank(Phi)) < Phi.shape[-1]:
+        what, count = ("n + m", needed) if Phi.shape[-1] == needed else ("n + m + 1", needed + 1)
+        raise ExcitationError(
+            f"recording: states and inputs span {rank} dimensions, {what} = {count} are needed to identify the "
+            "dynamics; record with inputs that vary independently of the state"
+        )

@@ -1,0 +1,110 @@
+"""Covariances of trajectories: C = diag(D) + U U', which is dense where U has d columns.
+
+A projection weighs its correction by one: what is known badly is moved most. Of nearly low rank, C costs O(dk), so
+that dynamics are projected onto in O(T).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from dadiff.errors import ConfigError, ShapeError
+from dadiff.trajectory.response import along
+from dadiff.trajectory.subspace import semidefinite_root
+
+
+@dataclass(frozen=True, eq=False)
+class Covariance:
+    """C = diag(D) + U U'. Two are the same only if they are one object: projections keep what they compute from it.
+
+    Args:
+        diagonal: D of shape (*batch, d), not negative.
+        factor: U of shape (*batch, d, k); k = 0 for a diagonal C.
+
+    Raises:
+        ShapeError, ConfigError: if the shapes disagree or D has a negative entry.
+    """
+
+    diagonal: np.ndarray = field(repr=False)
+    factor: np.ndarray = field(repr=False)
+
+    def __post_init__(self) -> None:
+        if self.factor.ndim < 2 or self.factor.shape[:-1] != self.diagonal.shape:
+            raise ShapeError(
+                f"covariance: D has shape {self.diagonal.shape}, U {self.factor.shape}; expected (..., d), (..., d, k)"
+            )
+        if not (self.diagonal >= 0).all():
+            raise ConfigError("covariance: a variance on the diagonal is negative or not finite")
+
+    @classmethod
+    def diagonal_of(cls, variances: np.ndarray) -> Covariance:
+        """diag(D) from D (*batch, d)."""
+        return cls(variances, np.zeros((*variances.shape, 0)))
+
+    @classmethod
+    def dense(cls, matrix: np.ndarray) -> Covariance:
+        """A symmetric positive semidefinite matrix (*batch, d, d)."""
+        return cls(np.zeros(matrix.shape[:-1]), semidefinite_root(matrix))
+
+    @property
+    def size(self) -> int:
+        """d."""
+        return self.diagonal.shape[-1]
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """C, (*batch, d, d)."""
+        full = self.factor @ self.factor.swapaxes(-1, -2)
+        np.einsum("...ii->...i", full)[...] += self.diagonal
+        return full
+
+    def times(self, v: np.ndarray) -> np.ndarray:
+        """C v for vectors (*batch, ..., d)."""
+        weights = self.diagonal.reshape(*self.diagonal.shape[:-1], *(1,) * (v.ndim - self.diagonal.ndim), self.size)
+        return weights * v + along(self.factor, along(self.factor.swapaxes(-1, -2), v))
+
+    def plus(self, other: Covariance) -> Covariance:
+        """The sum of two."""
+        batch = np.broadcast_shapes(self.diagonal.shape, other.diagonal.shape)
+        factors = [np.broadcast_to(c.factor, (*batch, c.factor.shape[-1])) for c in (self, other)]
+        return Covariance(self.diagonal + other.diagonal, np.concatenate(factors, axis=-1))
+
+    def scaled(self, a: float) -> Covariance:
+        """a C with a >= 0."""
+        return Covariance(a * self.diagonal, np.sqrt(a) * self.factor)
+
+    def rescaled(self, scale: np.ndarray) -> Covariance:
+        """S C S with S = diag(scale): the covariance of S z from that of z."""
+        return Covariance(scale**2 * self.diagonal, scale[:, None] * self.factor)
+
+    def given(self, places: Sequence[int] | np.ndarray) -> tuple[Covariance, np.ndarray]:
+        """What is left once entries E z (k,) are known, and the gain with which they move the others.
+
+            gain = C E' (E C E')^+,    C - gain E C
+
+        It has the same form, with D = 0 and U = 0 at the known entries.
+
+        Returns:
+            (C given E z, gain (*batch, d, k)).
+        """
+        D, U = self.diagonal, self.factor
+        D_p, U_p = D[..., places], U[..., places, :]
+        inner = U_p @ U_p.swapaxes(-1, -2)
+        np.einsum("...ii->...i", inner)[...] += D_p
+        inverse = np.linalg.pinv(inner, hermitian=True)
+        gain = U @ (U_p.swapaxes(-1, -2) @ inverse)
+        gain[..., places, :] += D_p[..., :, None] * inverse
+        left = np.eye(U.shape[-1]) - U_p.swapaxes(-1, -2) @ inverse @ U_p
+        remaining, D = U @ semidefinite_root(left), D.copy()
+        D[..., places], remaining[..., places, :] = 0, 0
+        return Covariance(D, remaining), gain
+
+    def draw(self, rng: np.random.Generator, shape: tuple[int, ...] = ()) -> np.ndarray:
+        """Samples of N(0, C), (*batch, *shape, d)."""
+        batch, k = self.diagonal.shape[:-1], self.factor.shape[-1]
+        eps = rng.standard_normal((*batch, *shape, self.size))
+        deviations = np.sqrt(self.diagonal).reshape(*batch, *(1,) * len(shape), self.size)
+        return deviations * eps + along(self.factor, rng.standard_normal((*batch, *shape, k)))
