@@ -28,21 +28,19 @@ from dadiff.folders import shipped
 
 def one_run(config: dict[str, Any]) -> None:
     """Execute one resolved configuration, track it, and print its table."""
-    from dadiff.config import assemble
-    from dadiff.running.identity import identify
+    from dadiff.running.assembly import Experiment
 
-    parts = assemble(config, config["choices"])
-    identity = identify(config, parts)
-    if parts.settings.dry_run:
-        print(f"{identity.key}  {identity.name}")
+    experiment = Experiment.of(config)
+    if experiment.parts.settings.dry_run:
+        print(f"{experiment.identity.key}  {experiment.identity.name}")
         return
-    parts["tracking"].prepare()
-    parts["tracking"].close_dead(parts.settings.output_dir)
+    experiment.parts.tracking.prepare()
+    experiment.parts.tracking.close_dead(experiment.output_dir)
 
-    from dadiff.launching.jobs import run
+    from dadiff.launching.jobs import run_experiment
     from dadiff.running.summary import summary
 
-    stored = run(config)
+    stored = run_experiment(experiment)
     print(summary([stored]))
     print(f"stored in {stored.folder}")
 
@@ -75,7 +73,7 @@ def check_what_is_printed(arguments: list[str]) -> None:
     except HydraException:
         return  # Hydra will compose it again, and say it in its own words
     resolved = plain(config, config.hydra.runtime.choices)
-    assemble(resolved, resolved["choices"])
+    assemble(resolved)
 
 
 def components_named(arguments: list[str]) -> list[str]:

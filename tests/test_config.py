@@ -17,8 +17,8 @@ from laws import CONF, composed
 
 from dadiff.behaviours import Hankel, Known
 from dadiff.config import assemble, build
-from dadiff.config.build import completed
 from dadiff.errors import ConfigError
+from dadiff.launching import jobs
 
 
 @cache
@@ -39,12 +39,8 @@ def with_value(override: str) -> dict[str, Any]:
 def refused(make: Callable[[], dict[str, Any]]) -> str:
     """The one line with which a configuration is refused."""
 
-    def assembled() -> None:
-        config = make()
-        assemble(config, config["choices"])
-
     with pytest.raises(ConfigError) as caught:
-        assembled()
+        assemble(make())
     assert "\n" not in str(caught.value)
     return str(caught.value)
 
@@ -59,7 +55,8 @@ def test_defaults_written_out_or_left_out_are_the_same():
         {"_target_": "dadiff.behaviours.Known"},
         {"_target_": "dadiff.behaviours.Known", "initial_state": "free"},
     )
-    assert completed(short, "projector") == completed(long, "projector") == long
+    nodes = [assemble({**usual(), "projector": node}).nodes["projector"] for node in (short, long)]
+    assert nodes == [long, long]
     assert build(short, "projector") == build(long, "projector") == Known()
 
 
@@ -194,4 +191,19 @@ def test_a_key_misspelt_inside_a_preset_is_named_with_its_file(tmp_path):
     with pytest.raises(
         ConfigError, match=r"^sampler \(sampler/ddpm\.yaml\): key 'last_step_noice' .* last_step_noise\?$"
     ):
-        assemble(config, config["choices"])
+        assemble(config)
+
+
+def test_a_configuration_is_resolved_once_in_a_trained_run(tmp_path, monkeypatch):
+    small = [
+        "dataset.train_size=20",
+        "dataset.test_size=2",
+        "training.steps=2",
+        "training.warmup=1",
+        "denoiser.width=8",
+    ]
+    few = ["sampler=ddim", "sampler.num_steps=2", "evaluation.samples=1", "tracking.enabled=false", "progress=false"]
+    config, resolved = composed(*small, *few, f"output_dir={tmp_path}"), []
+    monkeypatch.setattr("dadiff.running.parts.assemble", lambda config: resolved.append(config) or assemble(config))
+    assert jobs.run(config).status == "finished"
+    assert len(resolved) == 1

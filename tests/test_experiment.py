@@ -14,7 +14,8 @@ import yaml
 from laws import composed
 
 from dadiff.errors import ConfigError, ExcitationError, StoreError
-from dadiff.running.experiment import execute, prepare
+from dadiff.running.assembly import Experiment
+from dadiff.running.experiment import execute
 from dadiff.store import StoredRun
 
 SMALL = (
@@ -54,7 +55,7 @@ def run(base, tmp_path):
             path, _, value = override.partition("=")
             *groups, key = path.split(".")
             (config[groups[0]] if groups else config)[key] = yaml.safe_load(value)
-        return execute(config)
+        return execute(Experiment.of(config))
 
     return execute_small
 
@@ -141,10 +142,10 @@ def test_a_tiny_training_is_done_once_for_two_projectors(tmp_path):
     overrides = [o for o in SMALL if o != "denoiser=gaussian"] + ["training.steps=5", "training.batch_size=8"]
     small = ["denoiser.width=8", "denoiser.blocks=1", "training.warmup=1", f"output_dir={tmp_path}"]
     known, none = (composed(f"projector={name}", *overrides, *small) for name in ("known", "none"))
-    prepare(known)
+    Experiment.of(known).prepare()
     models = list((tmp_path / "cache" / "denoiser").glob("*/model.safetensors"))
     stamps = [model.stat().st_mtime_ns for model in models]
-    runs = [execute(known), execute(none)]
+    runs = [execute(Experiment.of(known)), execute(Experiment.of(none))]
     assert len(models) == 1
     assert [
         model.stat().st_mtime_ns for model in (tmp_path / "cache" / "denoiser").glob("*/model.safetensors")
@@ -205,5 +206,5 @@ def test_noise_prediction_is_refused_where_nothing_of_the_signal_is_left(tmp_pat
     overrides = [o for o in SMALL if o != "denoiser=gaussian"]
     config = composed("denoiser=mlp", "denoiser.prediction=noise", *overrides, f"output_dir={tmp_path}")
     with pytest.raises(ConfigError, match="prediction=noise divides by sqrt\\(alpha_bar_L\\)"):
-        execute(config)
+        execute(Experiment.of(config))
     assert left_behind(tmp_path) == []

@@ -291,7 +291,7 @@ def test_one_training_serves_all_projectors_and_recording_lengths():
 @pytest.mark.parametrize("told", ["nothing", "recording"])
 def test_a_stored_run(tmp_path, told):
     denoiser = [f"denoiser={'mlp_recording' if told == 'recording' else 'mlp'}", f"task.condition_on={told}"]
-    run = execute(composed(*denoiser, *TINY, f"output_dir={tmp_path}", "projector.initial_state=fixed"))
+    run = execute(Experiment.of(composed(*denoiser, *TINY, f"output_dir={tmp_path}", "projector.initial_state=fixed")))
     assert run.record.counts == {"cases": 3, "samples": 1, "robots": 4}
     assert run.metrics["gap"] < 1e-18
     assert {"median_cost_ratio", "robots_served"} <= set(run.metrics)

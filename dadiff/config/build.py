@@ -38,12 +38,6 @@ def build(node: Mapping[str, Any], where: str, trusted: Sequence[str] = ()) -> A
     return target(**check(node, target, where))
 
 
-def completed(node: Mapping[str, Any], where: str, trusted: Sequence[str] = ()) -> dict[str, Any]:
-    """The node with every parameter that it leaves to its default, so that both spellings are one identity."""
-    target = resolve(node, where, trusted)
-    return {TARGET: node[TARGET], **defaults(target), **check(node, target, where)}
-
-
 def defaults(target: Callable[..., Any]) -> dict[str, Any]:
     """The parameters that a target does not need to be given."""
     parameters = inspect.signature(target).parameters.items()

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from dadiff.config.build import TARGET, build, check, completed, resolve
+from dadiff.config.build import TARGET, check, defaults, resolve
 from dadiff.config.trust import check_trusted, trusted
 from dadiff.errors import ConfigError
 
@@ -54,14 +54,17 @@ class Settings:
 
 
 @dataclass(frozen=True)
-class Parts:
-    """A configuration's settings and components, by group."""
+class Assembled:
+    """A configuration that was checked and built.
+
+    Args:
+        nodes: group -> its configuration, with every parameter that was left to its default.
+        components: group -> what was built of it.
+    """
 
     settings: Settings
+    nodes: Mapping[str, Mapping[str, Any]]
     components: Mapping[str, Any]
-
-    def __getitem__(self, group: str) -> Any:
-        return self.components[group]
 
 
 def settings_of(config: Mapping[str, Any]) -> Settings:
@@ -76,29 +79,25 @@ def settings_of(config: Mapping[str, Any]) -> Settings:
     return settings
 
 
-def assemble(config: Mapping[str, Any], choices: Mapping[str, str] | None = None) -> Parts:
+def assemble(config: Mapping[str, Any]) -> Assembled:
     """Build every component of a resolved configuration, after all of it is checked.
 
     Args:
-        config: nested plain mapping.
-        choices: group -> name of the preset, so that messages can name the file.
+        config: nested plain mapping; `choices` says which preset each group is, so that messages can name the file.
+
+    Raises:
+        ConfigError: if anything in it is not valid.
     """
     settings = settings_of(config)
-    nodes = {group: (_node(config, group), where(group, choices)) for group in GROUPS}
-    for node, place in nodes.values():
-        check(node, resolve(node, place, trusted()), place)
-    built = {}
-    for group in reversed(GROUPS):  # the system last: it loads python-control, and mistakes elsewhere are told before
-        node, place = nodes[group]
-        built[group] = build(node, place, trusted())
-    return Parts(settings, built)
-
-
-def complete(config: Mapping[str, Any]) -> dict[str, Any]:
-    """The configuration with every default written out."""
-    settings = settings_of(config)
-    groups = {group: completed(_node(config, group), group, trusted()) for group in GROUPS}
-    return {**{f.name: getattr(settings, f.name) for f in fields(settings)}, **groups}
+    targets, given, nodes = {}, {}, {}
+    for group in GROUPS:
+        node, place = _node(config, group), where(group, settings.choices)
+        targets[group] = resolve(node, place, trusted())
+        given[group] = check(node, targets[group], place)
+        nodes[group] = {TARGET: node[TARGET], **defaults(targets[group]), **given[group]}
+    # the system last: it loads python-control, and mistakes elsewhere are told before
+    built = {group: targets[group](**given[group]) for group in reversed(GROUPS)}
+    return Assembled(settings, nodes, built)
 
 
 def where(group: str, choices: Mapping[str, str] | None = None) -> str:

@@ -13,7 +13,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -28,6 +28,15 @@ UNREADABLE = (
     *(OSError, EOFError, ValueError, SyntaxError, RuntimeError),
     *(zipfile.BadZipFile, zlib.error, tokenize.TokenError),
 )
+
+
+@runtime_checkable
+class FromFiles(Protocol):
+    """What reads files under its `path`: they count by what they hold and not by where they lie."""
+
+    def fingerprint(self) -> str:
+        """A hash of the content."""
+        ...
 
 
 def list_files(folder: Path) -> list[Path]:

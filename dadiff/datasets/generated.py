@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, get_args, runtime_checkable
 
 from dadiff.errors import ConfigError
 from dadiff.randomness import numpy_generator
-from dadiff.systems import LinearSystem
+from dadiff.systems import Family, LinearSystem
 from dadiff.tasks import Cases, Demonstrations, Task
 
 Part = Literal["train", "test"]
+PARTS: tuple[Part, ...] = get_args(Part)
 
 
+@runtime_checkable
 class Dataset(Protocol):
     """Where demonstrations and test cases come from."""
 
@@ -20,7 +22,7 @@ class Dataset(Protocol):
         """What a part depends on, for its key: sizes and seeds, or what files hold."""
         ...
 
-    def train(self, task: Task, system: LinearSystem) -> Demonstrations:
+    def train(self, task: Task, system: LinearSystem | Family) -> Demonstrations:
         """The demonstrations."""
         ...
 
@@ -51,7 +53,7 @@ class Generated:
         """What the demonstrations or the cases depend on."""
         return {"generated": self.train_size if part == "train" else self.test_size, "seed": self.seed}
 
-    def train(self, task: Task, system: LinearSystem) -> Demonstrations:
+    def train(self, task: Task, system: LinearSystem | Family) -> Demonstrations:
         """`train_size` demonstrations."""
         return task.demonstrations(system, self.train_size, numpy_generator(self.seed, "demonstrations"))
 

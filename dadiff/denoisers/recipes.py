@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Protocol
+from typing import TYPE_CHECKING, ClassVar, Protocol, runtime_checkable
 
 from dadiff.denoisers.prediction import PredictionChoice
 from dadiff.diffusion.schedule import Schedule
@@ -40,6 +40,7 @@ class Recipe(Protocol):
         ...
 
 
+@runtime_checkable
 class ExactRecipe(Protocol):
     """A denoiser that is known and not trained."""
 

@@ -84,7 +84,7 @@ class SweepRun:
     def ended(self, cell: PlannedCell, outcome: Outcome) -> None:
         """Record a cell's failure on disk, beside the results of the others."""
         if outcome.status != "finished":
-            jobs.record_end(cell.config, outcome.status, outcome.reason or outcome.status)
+            jobs.record_end(cell.identity, cell.config, outcome.status, outcome.reason or outcome.status)
 
     def close(self, parent: str | None, outcomes: Mapping[str, Outcome], *, interrupted: bool) -> Sweep:
         """Bring the sweep's record and MLflow up to date. Returns the record."""

@@ -6,27 +6,34 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import torch
-
-from dadiff.config import Parts, assemble
 from dadiff.datasets.cached import load_data, save_data
-from dadiff.denoisers.checkpoints import load
-from dadiff.denoisers.learning import train
+from dadiff.denoisers.recipes import ExactRecipe, Recipe
 from dadiff.errors import ConfigError
-from dadiff.running.identity import Artefact, Identity, identify
+from dadiff.experts.lqr import GaussianLaw
+from dadiff.running.identity import Artefact, Identity, identity_of
+from dadiff.running.parts import Parts
 from dadiff.store import Cache, Results
 from dadiff.systems import LinearSystem
 from dadiff.tasks import Cases, Demonstrations
+from dadiff.tasks.task import Augmenting, Lawful
 from dadiff.trajectory.coordinates import Coordinates, physical, standardised
 from dadiff.trajectory.layout import Layout, TrajectoryLayout
+
+if TYPE_CHECKING:
+    from dadiff.denoisers.learned import NetworkDenoiser
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """The components of a run, and what follows from them before anything is sampled."""
+    """The components of a run, and what follows from them before anything is sampled.
 
+    Args:
+        config: the resolved configuration that all of it was made from.
+    """
+
+    config: Mapping[str, Any]
     parts: Parts
     identity: Identity
     cache: Cache
@@ -39,14 +46,19 @@ class Experiment:
         Raises:
             ConfigError: if it is not valid.
         """
-        parts = assemble(config, config.get("choices"))
+        parts = Parts.of(config)
         output_dir = Path(parts.settings.output_dir).absolute()
-        return cls(parts, identify(config, parts), Cache(output_dir), Results(output_dir))
+        return cls(config, parts, identity_of(parts), Cache(output_dir), Results(output_dir))
+
+    @property
+    def output_dir(self) -> str:
+        """Where everything is written."""
+        return self.parts.settings.output_dir
 
     @cached_property
     def target(self) -> LinearSystem:
         """The system, or the robots, that plans are made for."""
-        target = self.parts["task"].target(self.parts["system"])
+        target = self.parts.task.target(self.parts.system)
         if not isinstance(target, LinearSystem):
             raise ConfigError(
                 "task: it plans for one system, and the chosen system is a family of robots; "
@@ -57,27 +69,27 @@ class Experiment:
     @cached_property
     def layout(self) -> TrajectoryLayout:
         """Of this task's trajectories."""
-        return self.target.layout(self.parts["task"].horizon)
+        return self.target.layout(self.parts.task.horizon)
 
     @cached_property
     def demonstrations(self) -> Demonstrations:
         """What is learned from: from the cache, or made now."""
         _ = self.target  # which refuses a system that the task cannot plan for
-        draw = self.parts["dataset"].train
-        build = partial(save_data, draw=lambda: draw(self.parts["task"], self.parts["system"]))
+        draw = self.parts.dataset.train
+        build = partial(save_data, draw=lambda: draw(self.parts.task, self.parts.system))
         return Demonstrations(**load_data(self._cached(self.identity.demonstrations, build)))
 
     @cached_property
     def cases(self) -> Cases:
         """What is planned for: from the cache, or made now."""
-        draw = self.parts["dataset"].test
-        build = partial(save_data, draw=lambda: draw(self.parts["task"], self.target))
+        draw = self.parts.dataset.test
+        build = partial(save_data, draw=lambda: draw(self.parts.task, self.target))
         return Cases(self.condition, **load_data(self._cached(self.identity.cases, build)))
 
     @property
     def condition(self) -> Layout:
         """Of E."""
-        return self.parts["task"].condition(self.target)
+        return self.parts.task.condition(self.target)
 
     @cached_property
     def coordinates(self) -> Coordinates:
@@ -93,6 +105,8 @@ class Experiment:
         Raises:
             ConfigError: if cuda is asked for and not there.
         """
+        import torch
+
         wanted, there = self.parts.settings.device, torch.cuda.is_available()
         if wanted == "cuda" and not there:
             raise ConfigError("device: cuda is asked for, but torch sees no GPU; use device=auto or device=cpu")
@@ -101,20 +115,24 @@ class Experiment:
     @cached_property
     def denoiser(self) -> Any:
         """The exact denoiser, or the trained one from the cache or trained now."""
-        recipe, schedule, artefact = self.parts["denoiser"], self.parts["schedule"], self.identity.denoiser
-        if artefact is None:
-            return recipe.exact(self._law(), self.coordinates, schedule, self.device)
-        folder = self._cached(artefact, self._train, resumable=True)
-        file = folder / "model.safetensors"
-        return load(file, recipe, self.layout, self.condition, schedule).to(self.device)
+        recipe = self.parts.denoiser
+        if isinstance(recipe, ExactRecipe):
+            return recipe.exact(self.law, self.coordinates, self.parts.schedule, self.device)
+        return self._trained(recipe)
 
     def prepare(self) -> None:
         """Build what is shared with other runs."""
         _ = self.demonstrations, self.cases, self.denoiser
 
-    def _law(self) -> Any:
-        task = self.parts["task"]
-        if not hasattr(task, "law"):
+    @cached_property
+    def law(self) -> GaussianLaw:
+        """Of demonstrations given E.
+
+        Raises:
+            ConfigError: if the task's law is not Gaussian.
+        """
+        task = self.parts.task
+        if not isinstance(task, Lawful):
             raise ConfigError(
                 "denoiser: the exact denoiser needs a task whose law is Gaussian; use task=lqr or denoiser=mlp"
             )
@@ -123,18 +141,29 @@ class Experiment:
     def _cached(self, artefact: Artefact, build: Callable[[Path], None], *, resumable: bool = False) -> Path:
         return self.cache.get_or_build(artefact.kind, artefact.key, artefact.determined_by, build, resumable=resumable)
 
-    def _train(self, folder: Path) -> None:
-        demonstrations = self.demonstrations
+    def _trained(self, recipe: Recipe) -> NetworkDenoiser:
+        from dadiff.denoisers.checkpoints import load
+
+        if self.identity.denoiser is None:
+            raise ConfigError("denoiser: it is neither trainable nor exact; see Recipe and ExactRecipe")
+        folder = self._cached(self.identity.denoiser, partial(self._train, recipe), resumable=True)
+        file = folder / "model.safetensors"
+        return load(file, recipe, self.layout, self.condition, self.parts.schedule).to(self.device)
+
+    def _train(self, recipe: Recipe, folder: Path) -> None:
+        from dadiff.denoisers.learning import train
+
+        task, demonstrations = self.parts.task, self.demonstrations
         train(
-            self.parts["denoiser"],
+            recipe,
             self.layout,
             self.condition,
-            self.parts["schedule"],
-            self.parts["training"],
+            self.parts.schedule,
+            self.parts.training,
             self.coordinates.to_scaled(demonstrations.trajectories),
             demonstrations.environment,
             folder,
             device=self.device,
-            augment=getattr(self.parts["task"], "augment", None),
+            augment=task.augment if isinstance(task, Augmenting) else None,
             progress=self.parts.settings.progress,
         )

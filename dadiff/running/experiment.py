@@ -1,13 +1,12 @@
 """One run, from configuration to stored result: the place where all rooms meet.
 
-prepare   builds what the run shares with others: the data set and the trained denoiser
-execute   samples plans for every test case, evaluates them, and stores the result whole
+Samples plans for every test case, evaluates them, and stores the result whole.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -67,25 +66,19 @@ class Plans:
     snapshots: Snapshots
 
 
-def execute(config: Mapping[str, Any]) -> StoredRun:
-    """Run one resolved configuration, or return its stored result.
+def execute(experiment: Experiment) -> StoredRun:
+    """Run an experiment, or return its stored result.
 
     Raises:
         DadiffError: if the configuration, the data or the store do not allow it.
     """
-    experiment = Experiment.of(config)
     results, key = experiment.results, experiment.identity.key
     with results.working(key):
         if results.is_done(key) and not experiment.parts.settings.force:
             return results.read(key)
         started = time.time()
         plans = draw_plans(experiment)
-        return _store(experiment, config, plans, started)
-
-
-def prepare(config: Mapping[str, Any]) -> None:
-    """Build the data set and the trained denoiser of a resolved configuration."""
-    Experiment.of(config).prepare()
+        return _store(experiment, plans, started)
 
 
 def projection_of(experiment: Experiment, x_init: np.ndarray) -> tuple[Projection | None, dict[str, float]]:
@@ -94,7 +87,7 @@ def projection_of(experiment: Experiment, x_init: np.ndarray) -> tuple[Projectio
     Args:
         x_init: (*robots, plans, n).
     """
-    projector, layout = experiment.parts["projector"], experiment.layout
+    projector, layout = experiment.parts.projector, experiment.layout
     sources = _sources(experiment)
     start = time.perf_counter()
     fitted = projector.fit(layout, system=experiment.target, **sources)
@@ -110,9 +103,9 @@ def projection_of(experiment: Experiment, x_init: np.ndarray) -> tuple[Projectio
 
 def _sources(experiment: Experiment) -> dict[str, Any]:
     """What the projector learns from, besides the system."""
-    needs, sources = experiment.parts["projector"].needs, {}
+    needs, sources = experiment.parts.projector.needs, dict[str, Any]()
     if "recording" in needs:
-        sources["recording"] = experiment.parts["recording"].record(experiment.target)
+        sources["recording"] = experiment.parts.recording.record(experiment.target)
     if "demonstrations" in needs:
         sources["demonstrations"] = experiment.demonstrations.trajectories
     return sources
@@ -121,10 +114,10 @@ def _sources(experiment: Experiment) -> dict[str, Any]:
 def draw_plans(experiment: Experiment) -> Plans:
     """Sample plans for every case, with the same noise whatever the projector."""
     parts, cases = experiment.parts, experiment.cases
-    evaluation, schedule = parts["evaluation"], parts["schedule"]
+    evaluation, schedule = parts.evaluation, parts.schedule
     environment = np.repeat(cases.environment, evaluation.samples, axis=-2)
     projection, measures = projection_of(experiment, np.repeat(cases.x_init, evaluation.samples, axis=-2))
-    _check_enforcement(parts["enforcement"], projection)
+    _check_enforcement(parts.enforcement, projection)
     device = experiment.device
     project = Timed(projection, device) if projection else None
     denoiser = experiment.denoiser  # after the projection, which may refuse what it is given
@@ -133,8 +126,8 @@ def draw_plans(experiment: Experiment) -> Plans:
     shape = (*environment.shape[:-1], experiment.layout.size)
     start = time.perf_counter()
     samples = sample(
-        parts["sampler"], schedule, denoiser, torch.as_tensor(environment, device=experiment.device), shape,
-        torch_generator(evaluation.seed, "sampling noise"), project, parts["enforcement"],
+        parts.sampler, schedule, denoiser, torch.as_tensor(environment, device=experiment.device), shape,
+        torch_generator(evaluation.seed, "sampling noise"), project, parts.enforcement,
         watch,
         evaluation.divergence_bound, parts.settings.progress,
     )  # fmt: skip
@@ -157,15 +150,15 @@ def _check_enforcement(enforcement: Enforcement, projection: Projection | None) 
 def _observers(experiment: Experiment, environment: np.ndarray) -> tuple[ChainRecorder | None, Snapshots]:
     """The recorder of Theorem 1, where the law is known and there is one system; and snapshots of the first plan."""
     parts = experiment.parts
-    snapshots = Snapshots(parts["schedule"].alpha_bar, (0,) * (environment.ndim - 1))
-    if parts["denoiser"].trainable or environment.ndim > 2:
+    snapshots = Snapshots(parts.schedule.alpha_bar, (0,) * (environment.ndim - 1))
+    if parts.denoiser.trainable or environment.ndim > 2:
         return None, snapshots
-    followed = np.arange(0, len(environment), parts["evaluation"].samples)
-    distance = MahalanobisDistance.of(parts["task"].law(experiment.target), environment[followed])
+    followed = np.arange(0, len(environment), parts.evaluation.samples)
+    distance = MahalanobisDistance.of(experiment.law, environment[followed])
     return ChainRecorder(distance, followed, experiment.coordinates.to_physical), snapshots
 
 
-def _store(experiment: Experiment, config: Mapping[str, Any], plans: Plans, started: float) -> StoredRun:
+def _store(experiment: Experiment, plans: Plans, started: float) -> StoredRun:
     """Evaluate and write. Of a diverged chain nothing but where it diverged, and how its distance went."""
     diverged_at = plans.samples.diverged_at
     written = {"chain": plans.chain.table()} if plans.chain else {}
@@ -177,17 +170,17 @@ def _store(experiment: Experiment, config: Mapping[str, Any], plans: Plans, star
         arrays = examples(experiment, plans)
     record = record_of(
         experiment.identity,
-        config,
+        experiment.config,
         "finished" if diverged_at is None else "diverged",
         started,
         experiment.device,
         reason=None if diverged_at is None else f"a value exceeded the bound at step {diverged_at}",
         diverged_step=diverged_at,
         metrics=metrics,
-        notes={"cases": experiment.cases.notes, "schedule": experiment.parts["schedule"].conditions()},
+        notes={"cases": experiment.cases.notes, "schedule": experiment.parts.schedule.conditions()},
         counts=_counts(experiment),
     )
-    text = yaml.safe_dump(dict(config), sort_keys=False)
+    text = yaml.safe_dump(dict(experiment.config), sort_keys=False)
     return experiment.results.write(record, config_text=text, tables=written, arrays=arrays)
 
 
@@ -197,7 +190,7 @@ def evaluate(experiment: Experiment, planned: np.ndarray) -> Scores:
     rollout = replay(system, layout, planned, cases.x_init)
     return merged(
         tracking_errors(system, layout, cases, planned, rollout),
-        experiment.parts["task"].score(system, cases, planned, rollout),
+        experiment.parts.task.score(system, cases, planned, rollout),
     )
 
 
@@ -208,7 +201,7 @@ def examples(experiment: Experiment, plans: Plans) -> dict[str, np.ndarray]:
     reference_inputs (cases, T, m), and environment_* (cases, ...), the channels of E. Of a fleet all these have a
     first dimension of a few robots that differ most, `robots` (k,) says which ones, and their first case is the same.
     """
-    layout, cases, count = experiment.layout, experiment.cases, experiment.parts["evaluation"].examples
+    layout, cases, count = experiment.layout, experiment.cases, experiment.parts.evaluation.examples
     system, shown = _shown(experiment.target)
     planned = plans.planned[shown][..., :count, :, :]
     reference, environment = (values[shown][..., :count, :] for values in (cases.reference, cases.environment))
@@ -241,13 +234,13 @@ def _shown(target: LinearSystem) -> tuple[LinearSystem, Any]:
 
 def _noised(experiment: Experiment, reference: np.ndarray, steps: np.ndarray) -> np.ndarray:
     """The forward process applied to a reference (d,): sqrt(alpha_bar_i) z + sqrt(1 - alpha_bar_i) eps, (k, d)."""
-    alpha_bar = experiment.parts["schedule"].alpha_bar[steps][:, None]
-    eps = numpy_generator(experiment.parts["evaluation"].seed, "forward noise").standard_normal(reference.shape)
+    alpha_bar = experiment.parts.schedule.alpha_bar[steps][:, None]
+    eps = numpy_generator(experiment.parts.evaluation.seed, "forward noise").standard_normal(reference.shape)
     z = experiment.coordinates.to_scaled(reference)
     return experiment.coordinates.to_physical(np.sqrt(alpha_bar) * z + np.sqrt(1 - alpha_bar) * eps)
 
 
 def _counts(experiment: Experiment) -> dict[str, int]:
     *robots, num_cases, _ = experiment.cases.environment.shape
-    counts = {"cases": num_cases, "samples": experiment.parts["evaluation"].samples}
+    counts = {"cases": num_cases, "samples": experiment.parts.evaluation.samples}
     return counts | ({"robots": robots[0]} if robots else {})

@@ -15,8 +15,11 @@ from dataclasses import dataclass
 from typing import Any
 
 from dadiff.behaviours import NoProjector
+from dadiff.config import GROUPS
 from dadiff.config.build import TARGET, defaults, resolve
-from dadiff.config.settings import GROUPS, Parts, assemble, complete
+from dadiff.datasets.files import FromFiles
+from dadiff.datasets.generated import PARTS, Dataset
+from dadiff.running.parts import Parts
 
 FORMAT = 1  # raised whenever a change moves results; see CHANGELOG
 
@@ -76,19 +79,18 @@ def digest(value: Any) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def identify(config: Mapping[str, Any], parts: Parts | None = None) -> Identity:
-    """The identity of a resolved configuration.
-
-    Args:
-        config: nested plain mapping.
-        parts: its components, if they are assembled already.
+def identify(config: Mapping[str, Any]) -> Identity:
+    """The identity of a resolved configuration, a nested plain mapping.
 
     Raises:
         ConfigError: if the configuration is not valid.
     """
-    parts = parts or assemble(config, config.get("choices"))
-    given = {group: node for group, node in complete(config).items() if group in GROUPS}
-    nodes = {group: _content(parts[group], node) for group, node in given.items()}
+    return identity_of(Parts.of(config))
+
+
+def identity_of(parts: Parts) -> Identity:
+    """The identity of a run with these components."""
+    nodes = {group: _content(getattr(parts, group), node) for group, node in parts.nodes.items()}
     matters = _groups_that_matter(parts)
     coordinates = parts.settings.coordinates
     expert = {"format": FORMAT, "system": nodes["system"], "task": nodes["task"]}
@@ -102,37 +104,37 @@ def identify(config: Mapping[str, Any], parts: Parts | None = None) -> Identity:
     return Identity(
         determined_by,
         _name(choices, nodes, parts),
-        _axes(choices, given, parts),
+        _axes(choices, parts.nodes, parts),
         demonstrations,
         cases,
-        denoiser if parts["denoiser"].trainable else None,
+        denoiser if parts.denoiser.trainable else None,
         recording if "recording" in matters else None,
     )
 
 
 def _groups_that_matter(parts: Parts) -> list[str]:
     ignored = {"tracking"}
-    if not parts["denoiser"].trainable:
+    if not parts.denoiser.trainable:
         ignored.add("training")
-    if "recording" not in parts["projector"].needs:
+    if "recording" not in parts.projector.needs:
         ignored.add("recording")
-    if isinstance(parts["projector"], NoProjector):
+    if isinstance(parts.projector, NoProjector):
         ignored.add("enforcement")
     return [group for group in GROUPS if group not in ignored]
 
 
 def _content(component: Any, node: Mapping[str, Any]) -> dict[str, Any]:
     """The node; of data from files, what they hold in place of their path; of a data set, its two parts."""
-    if hasattr(component, "determined_by"):
-        return {TARGET: node[TARGET], **{part: component.determined_by(part) for part in ("train", "test")}}
-    if not hasattr(component, "fingerprint"):
-        return dict(node)
-    return {**{k: v for k, v in node.items() if k != "path"}, "content": component.fingerprint()}
+    if isinstance(component, Dataset):
+        return {TARGET: node[TARGET], **{part: component.determined_by(part) for part in PARTS}}
+    if isinstance(component, FromFiles):
+        return {**{k: v for k, v in node.items() if k != "path"}, "content": component.fingerprint()}
+    return dict(node)
 
 
 def _axes(choices: Mapping[str, str], nodes: Mapping[str, Mapping[str, Any]], parts: Parts) -> dict[str, Any]:
     leaves = {f"{g}.{k}": v for g in choices for k, v in nodes[g].items() if k != TARGET}
-    initial_state = getattr(parts["projector"], "initial_state", None)
+    initial_state = nodes["projector"].get("initial_state")
     settings = {"seed": parts.settings.seed, "coordinates": parts.settings.coordinates, "initial_state": initial_state}
     return {**choices, **settings, **leaves}
 

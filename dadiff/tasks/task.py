@@ -8,13 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 
 from dadiff.errors import DataError
-from dadiff.systems import LinearSystem
+from dadiff.experts.lqr import GaussianLaw
+from dadiff.systems import Family, LinearSystem
 from dadiff.trajectory import Layout
+
+if TYPE_CHECKING:
+    import torch
 
 
 @dataclass(frozen=True)
@@ -80,7 +84,7 @@ class Task(Protocol):
 
     horizon: int
 
-    def target(self, system: LinearSystem) -> LinearSystem:
+    def target(self, system: LinearSystem | Family) -> LinearSystem:
         """The system, or the robots, that plans are made for. A task of one system returns it."""
         ...
 
@@ -92,7 +96,7 @@ class Task(Protocol):
         """E (c,) of one environment that is given by its fields, each of them checked."""
         ...
 
-    def demonstrations(self, system: LinearSystem, count: int, rng: np.random.Generator) -> Demonstrations:
+    def demonstrations(self, system: LinearSystem | Family, count: int, rng: np.random.Generator) -> Demonstrations:
         """`count` expert demonstrations (a robot) in fresh environments."""
         ...
 
@@ -140,3 +144,21 @@ def numbers(value: object, field: str, shape: tuple[int, ...], place: str) -> np
         shown = ", ".join(f"{v:g}" for v in values.ravel())
         raise DataError(f"{place}: {field} is ({shown}); every number must be finite")
     return values
+
+
+@runtime_checkable
+class Lawful(Protocol):
+    """A task whose demonstrations have a Gaussian law given E, so that the exact denoiser is known."""
+
+    def law(self, system: LinearSystem) -> GaussianLaw:
+        """The law of demonstrations given E."""
+        ...
+
+
+@runtime_checkable
+class Augmenting(Protocol):
+    """A task that knows changes of E which leave the optimum as it is."""
+
+    def augment(self, environment: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+        """E (batch, c), changed at random."""
+        ...
