@@ -12,8 +12,9 @@ from laws import SYSTEMS, component, presets, tolerance, variants
 from dadiff.behaviours import Known, pins
 from dadiff.denoisers.exact import ExactDenoiser
 from dadiff.diffusion.chain import Samples, sample
+from dadiff.diffusion.context import Context, Counted, unprojected
 from dadiff.diffusion.enforcement import CleanEstimate, Convex, Literally, Never, Normalised, PostHoc
-from dadiff.diffusion.samplers import DDIM, DDPM
+from dadiff.diffusion.samplers import DDIM, DDPM, Step
 from dadiff.diffusion.schedule import Schedule, cosine, ddpm_linear, paper_linear
 from dadiff.randomness import torch_generator
 from dadiff.tasks import LQR
@@ -45,9 +46,9 @@ class Spy:
     def __init__(self, project):
         self.project, self.calls = project, 0
 
-    def __call__(self, tau):
+    def __call__(self, tau, metric=None, start=None):
         self.calls += 1
-        return self.project(tau)
+        return self.project(tau, metric)
 
 
 X_INIT = np.linspace(-1, 1, 2 * SYSTEM.state_dim)[: SYSTEM.state_dim].repeat(PLANS).reshape(-1, PLANS).T
@@ -91,7 +92,7 @@ def test_without_a_projector_plans_are_vanilla_bit_for_bit(enforcement):
 
 @every_stable
 def test_projecting_onto_everything_is_vanilla(enforcement):
-    np.testing.assert_allclose(draw(enforcement, lambda tau: tau).tau, draw(None, None).tau, atol=1e-12)
+    np.testing.assert_allclose(draw(enforcement, unprojected).tau, draw(None, None).tau, atol=1e-12)
 
 
 @every_enforcement
@@ -127,13 +128,20 @@ def test_the_noise_of_the_last_step_leads_off_the_set_again(enforcement):
 # --- the operators
 
 
+def at_step(schedule: Schedule, j: int, project=None) -> Context:
+    """The context of a step that reaches j."""
+    tau = torch.zeros(PLANS, LAYOUT.size, dtype=torch.float64)
+    step = Step(j + 1, j, 0.5, 0.5, 0.1)
+    return Context(step, schedule, tau, tau, project or projection(), Counted(None), lambda: tau)
+
+
 def gains(enforcement, schedule: Schedule, j: int) -> tuple[float, float]:
     """(on im F, across it) of what acts on the sample or on the clean estimate at step j."""
     P, tau = projection(), torch.randn(LAYOUT.size, dtype=torch.float64, generator=torch_generator(1, "test"))
-    within, across = P(tau), tau - P(tau)
+    within, across, at = P(tau), tau - P(tau), at_step(schedule, j, P)
 
     def operator(v):
-        return enforcement.sample(enforcement.clean(v, P, schedule, j), P, schedule, j)
+        return enforcement.sample(enforcement.clean(v, at), at)
 
     on, off = operator(within), operator(across)
     for image, of in ((on, within), (off, across)):  # both are eigenspaces
@@ -187,7 +195,7 @@ def test_the_literal_operator_grows_noise_by_the_product_of_its_gains():
     noise = torch.randn(PLANS, LAYOUT.size, dtype=torch.float64, generator=torch_generator(2, "test"))
     tau = projection()(noise)
     for j in range(900, 880, -1):
-        tau = Literally().sample(tau, projection(), schedule, j)
+        tau = Literally().sample(tau, at_step(schedule, j))
         grown.append(float(tau.norm() / projection()(noise).norm()))
     np.testing.assert_allclose(grown, np.cumprod(on[900:880:-1]), rtol=1e-10)
 

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from tqdm import tqdm
 
-from dadiff.diffusion.enforcement import Enforcement, Project
+from dadiff.diffusion.context import Context, Counted, Denoise, Project, unprojected
+from dadiff.diffusion.enforcement import Enforcement, Never
 from dadiff.diffusion.samplers import Sampler
 from dadiff.diffusion.schedule import Schedule
+from dadiff.trajectory.covariance import Covariance
 
 Tensor = torch.Tensor
-Denoise = Callable[[Tensor, int, Tensor], Tensor]
 Stage = Literal["predict", "project", "end"]
 Observe = Callable[[int, Stage, Tensor], None]
 
@@ -47,8 +48,9 @@ def sample(
     observe: Observe | None = None,
     divergence_bound: float = 1e6,
     progress: bool = False,
+    covariance: Callable[[int], Covariance] | None = None,
 ) -> Samples:
-    """Algorithm 1 (and 2): predict, then project, from i = L to 1.
+    """Algorithm 1 (and 2, which differ in P): predict, then project, from i = L to 1.
 
     Args:
         denoise: (tau_i, i, E) -> tau0_hat, of the shape of tau_i.
@@ -59,6 +61,7 @@ def sample(
         observe: is shown the sample after each prediction, after each projection, and after the end's.
         divergence_bound: the chain stops once max |tau| exceeds it.
         progress: show a progress bar.
+        covariance: i -> C_i, of the clean estimate, for enforcements that weigh by it.
 
     Returns:
         float64 plans; the chain as it stood if it diverged.
@@ -67,27 +70,24 @@ def sample(
     def noise() -> Tensor:
         return torch.randn(shape, generator=generator, dtype=torch.float64).to(environment.device)
 
-    tau, calls = noise(), 0
-    for step in tqdm(
-        sampler.steps(schedule), desc="sampling", unit="step", disable=None if progress else True, leave=False
-    ):
+    by = enforcement if enforcement and project else Never()
+    ask, memory = Counted(denoise), dict[str, Any]()
+    bar = tqdm(sampler.steps(schedule), desc="sampling", unit="step", disable=None if progress else True, leave=False)
+    tau = noise()  # line 1: tau_L ~ N(0, I)
+    for step in bar:  # line 2: for i = L, ..., 1
+        at = Context(step, schedule, tau, environment, project or unprojected, ask, noise, covariance, memory)
         mean = step.sample * tau
-        if step.call:
-            tau0_hat, calls = denoise(tau, step.i, environment), calls + 1
-            if project and enforcement:
-                tau0_hat = enforcement.clean(tau0_hat, project, schedule, step.j)
-            mean = mean + step.clean * tau0_hat
-        tau = mean + step.noise * noise() if step.noise else mean
+        if step.call:  # line 3: the clean estimate from tau_i, i and E, and the mean that follows from it
+            mean = mean + step.clean * by.clean(ask(tau, step.i, environment), at)
+        tau = mean + step.noise * noise() if step.noise else mean  # line 4: predict
         if observe:
             observe(step.j, "predict", tau)
-        if project and enforcement:
-            tau = enforcement.sample(tau, project, schedule, step.j)
+        tau = by.sample(tau, at)  # line 5: project
         if observe:
             observe(step.j, "project", tau)
         if not tau.abs().max() <= divergence_bound:
-            return Samples(tau, calls, diverged_at=step.i)
-    if project and enforcement:
-        tau = enforcement.end(tau, project)
-        if observe:
-            observe(0, "end", tau)
-    return Samples(tau, calls, diverged_at=None if tau.abs().max() <= divergence_bound else 0)
+            return Samples(tau, ask.calls, diverged_at=step.i)
+    tau = by.end(tau, at)  # line 6: tau_0
+    if observe:
+        observe(0, "end", tau)
+    return Samples(tau, ask.calls, diverged_at=None if tau.abs().max() <= divergence_bound else 0)

@@ -1,22 +1,19 @@
 """Where and how strongly a projection acts along the reverse chain.
 
 Three places: the clean estimate tau0_hat, the sample tau_j that a step produces, and the end of the chain.
-Each enforcement is one operator in one place; j is the step that the sample has reached, and beta_0 = 0, so at the
-last step those that act on the sample project exactly. P may be affine (x(0) fixed, scaled coordinates),
-which is why the operators are written with displacements P(tau) - tau.
+Each enforcement is told by a `Context` where the chain stands. Those of the paper are one operator in one place; j is
+the step that the sample has reached, and beta_0 = 0, so at the last step those that act on the sample project exactly.
+P may be affine (x(0) pinned, scaled coordinates), which is why operators are written with displacements P(tau) - tau.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from math import sqrt
 from typing import ClassVar, Literal, Protocol
 
-from dadiff.diffusion.schedule import Schedule
+from dadiff.diffusion.context import Context
 from dadiff.trajectory.layout import Array
-
-Project = Callable[[Array], Array]
 
 
 class Enforcement(Protocol):
@@ -24,11 +21,11 @@ class Enforcement(Protocol):
 
     affine: ClassVar[bool]
 
-    def clean(self, tau0_hat: Array, P: Project, schedule: Schedule, j: int) -> Array: ...
+    def clean(self, tau0_hat: Array, at: Context) -> Array: ...
 
-    def sample(self, tau: Array, P: Project, schedule: Schedule, j: int) -> Array: ...
+    def sample(self, tau: Array, at: Context) -> Array: ...
 
-    def end(self, tau: Array, P: Project) -> Array: ...
+    def end(self, tau: Array, at: Context) -> Array: ...
 
 
 @dataclass(frozen=True)
@@ -37,15 +34,15 @@ class Never:
 
     affine: ClassVar[bool] = True
 
-    def clean(self, tau0_hat: Array, P: Project, schedule: Schedule, j: int) -> Array:
+    def clean(self, tau0_hat: Array, at: Context) -> Array:
         """tau0_hat."""
         return tau0_hat
 
-    def sample(self, tau: Array, P: Project, schedule: Schedule, j: int) -> Array:
+    def sample(self, tau: Array, at: Context) -> Array:
         """tau."""
         return tau
 
-    def end(self, tau: Array, P: Project) -> Array:
+    def end(self, tau: Array, at: Context) -> Array:
         """tau."""
         return tau
 
@@ -54,19 +51,19 @@ class Never:
 class PostHoc(Never):
     """P once, after the last step: the baseline of every comparison."""
 
-    def end(self, tau: Array, P: Project) -> Array:
+    def end(self, tau: Array, at: Context) -> Array:
         """P(tau)."""
-        return P(tau)
+        return at.project(tau)
 
 
 @dataclass(frozen=True)
 class Normalised(Never):
     """P + sqrt(beta_j) (I - P) on the sample: the paper's operator with gain 1 on im F. The default."""
 
-    def sample(self, tau: Array, P: Project, schedule: Schedule, j: int) -> Array:
+    def sample(self, tau: Array, at: Context) -> Array:
         """P(tau) + sqrt(beta_j) (tau - P(tau))."""
-        projected = P(tau)
-        return projected + sqrt(schedule.beta[j]) * (tau - projected)
+        projected = at.project(tau)
+        return projected + sqrt(at.beta) * (tau - projected)
 
 
 @dataclass(frozen=True)
@@ -79,26 +76,26 @@ class Convex(Never):
 
     acts_on: Literal["sample", "clean_estimate"] = "sample"
 
-    def clean(self, tau0_hat: Array, P: Project, schedule: Schedule, j: int) -> Array:
+    def clean(self, tau0_hat: Array, at: Context) -> Array:
         """tau0_hat + a (P(tau0_hat) - tau0_hat), if it acts here."""
-        return self._blend(tau0_hat, P, schedule.alpha_bar[j]) if self.acts_on == "clean_estimate" else tau0_hat
+        return self._blend(tau0_hat, at) if self.acts_on == "clean_estimate" else tau0_hat
 
-    def sample(self, tau: Array, P: Project, schedule: Schedule, j: int) -> Array:
+    def sample(self, tau: Array, at: Context) -> Array:
         """tau + a (P(tau) - tau), if it acts here."""
-        return self._blend(tau, P, schedule.alpha_bar[j]) if self.acts_on == "sample" else tau
+        return self._blend(tau, at) if self.acts_on == "sample" else tau
 
     @staticmethod
-    def _blend(tau: Array, P: Project, a: float) -> Array:
-        return tau + float(a) * (P(tau) - tau)
+    def _blend(tau: Array, at: Context) -> Array:
+        return tau + at.alpha_bar * (at.project(tau) - tau)
 
 
 @dataclass(frozen=True)
 class CleanEstimate(Never):
     """P on the clean estimate only. The sample lies in the set if the last step adds no noise."""
 
-    def clean(self, tau0_hat: Array, P: Project, schedule: Schedule, j: int) -> Array:
+    def clean(self, tau0_hat: Array, at: Context) -> Array:
         """P(tau0_hat)."""
-        return P(tau0_hat)
+        return at.project(tau0_hat)
 
 
 @dataclass(frozen=True)
@@ -110,7 +107,6 @@ class Literally(Never):
 
     affine: ClassVar[bool] = False
 
-    def sample(self, tau: Array, P: Project, schedule: Schedule, j: int) -> Array:
+    def sample(self, tau: Array, at: Context) -> Array:
         """sqrt(1 - beta_j) P(tau) + sqrt(beta_j) tau."""
-        beta = schedule.beta[j]
-        return sqrt(1 - beta) * P(tau) + sqrt(beta) * tau
+        return sqrt(1 - at.beta) * at.project(tau) + sqrt(at.beta) * tau

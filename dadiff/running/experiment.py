@@ -40,11 +40,11 @@ class Timed:
     calls: int = 0
     seconds: float = 0.0
 
-    def __call__(self, *arguments: Any) -> Any:
+    def __call__(self, *arguments: Any, **options: Any) -> Any:
         """Call it."""
         self._wait()
         start = time.perf_counter()
-        result = self.function(*arguments)
+        result = self.function(*arguments, **options)
         self._wait()
         self.seconds += time.perf_counter() - start
         self.calls += 1
