@@ -6,9 +6,9 @@ import os
 import signal
 
 import pytest
-from laws import SYSTEMS
+from laws import AFFINE, SYSTEMS
 
-from dadiff.systems import LinearSystem
+from dadiff.systems import AffineSystem, Linear
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
@@ -32,6 +32,12 @@ def rng():
 
 
 @pytest.fixture(params=SYSTEMS.values(), ids=SYSTEMS.keys())
-def system(request) -> LinearSystem:
+def system(request) -> Linear:
     """The paper's system and others of other sizes, so that nothing assumes n = 4 and m = 2."""
+    return request.param
+
+
+@pytest.fixture(params=AFFINE.values(), ids=AFFINE.keys())
+def affine(request) -> AffineSystem:
+    """The same, one with an offset, and one that varies over 12 steps."""
     return request.param

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from dadiff.config import build
 from dadiff.config.build import resolve
 from dadiff.config.composed import plain
 from dadiff.launching import register
-from dadiff.systems import GaussianExcitation, LinearSystem, double_integrator
+from dadiff.systems import AffineSystem, GaussianExcitation, Linear, TimeVarying, double_integrator
 
 CONF = Path(__file__).parent.parent / "conf"
 
@@ -30,12 +31,14 @@ def tolerance(dtype: Any = np.float64, size: int = 1, conditioning: float = 1.0)
     return float(10 * np.finfo(dtype).eps * size * conditioning)
 
 
-def random_system(state_dim: int, input_dim: int, process_noise: float, seed: int) -> LinearSystem:
+def random_system(state_dim: int, input_dim: int, process_noise: float, seed: int) -> Linear:
     """A stable random system: spectral radius 0.9."""
     rng = np.random.default_rng(seed)
     A = rng.standard_normal((state_dim, state_dim))
-    return LinearSystem(
-        0.9 * A / np.abs(np.linalg.eigvals(A)).max(), rng.standard_normal((state_dim, input_dim)), process_noise
+    return Linear(
+        0.9 * A / np.abs(np.linalg.eigvals(A)).max(),
+        rng.standard_normal((state_dim, input_dim)),
+        process_noise=process_noise,
     )
 
 
@@ -46,15 +49,36 @@ SYSTEMS = {
 }
 
 
-def fleet(robots: int = 3, process_noise: float = 0.02) -> LinearSystem:
+def varying_system(state_dim: int, input_dim: int, steps: int, seed: int, *robots: int) -> TimeVarying:
+    """Random A_t, B_t and c_t, contracting."""
+    rng = np.random.default_rng(seed)
+    lead, n = (*robots, steps), state_dim
+    A = 0.9 * np.linalg.qr(rng.standard_normal((*lead, n, n)))[0]
+    B, c = rng.standard_normal((*lead, n, input_dim)), rng.standard_normal((*lead, n))
+    return TimeVarying(A, B, c, process_noise=np.linspace(0.0, 0.05, n), robots=robots)
+
+
+AFFINE = {
+    **SYSTEMS,
+    "with an offset": replace(SYSTEMS["n=3,m=1"], c=[0.3, -1.0, 0.5], process_noise=[0.1, 0.0, 0.02]),
+    "time-varying": varying_system(3, 2, 12, seed=5),
+}
+
+
+def fleet(robots: int = 3, process_noise: float = 0.02) -> Linear:
     """Stable random robots with n = 3, m = 2 along a leading dimension."""
     members = [random_system(3, 2, process_noise, seed) for seed in range(robots)]
-    return LinearSystem(np.stack([s.A for s in members]), np.stack([s.B for s in members]), process_noise)
+    return Linear(
+        np.stack([s.A for s in members]), np.stack([s.B for s in members]), process_noise=process_noise, robots=robots
+    )
 
 
-def members(robots: LinearSystem) -> list[LinearSystem]:
+def members(robots: AffineSystem) -> list[AffineSystem]:
     """A fleet's robots one by one."""
-    return [LinearSystem(A, B, robots.process_noise) for A, B in zip(robots.A, robots.B, strict=True)]
+    return [
+        type(robots)(A, B, c, process_noise=robots.process_noise)
+        for A, B, c in zip(robots.A, robots.B, robots.c, strict=True)
+    ]
 
 
 def presets(group: str) -> list[str]:
@@ -95,7 +119,7 @@ def variants(group: str, options: dict[str, tuple[Any, ...]]) -> dict[str, Any]:
     return found
 
 
-def trajectories(system: LinearSystem, horizon: int, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def trajectories(system: Linear, horizon: int, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """(tau, x_init) of noise-free roll-outs under random inputs: (*robots, count, d) and (*robots, count, n)."""
     rng = np.random.default_rng(seed)
     x_init = rng.standard_normal((*system.robots, count, system.state_dim))

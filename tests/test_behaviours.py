@@ -29,7 +29,7 @@ from dadiff.behaviours import (
     sets,
 )
 from dadiff.errors import ConfigError, ExcitationError, ShapeError
-from dadiff.systems import GaussianExcitation, LinearSystem, Recording, double_integrator
+from dadiff.systems import GaussianExcitation, Linear, Recording, double_integrator
 from dadiff.trajectory.coordinates import Coordinates, physical
 from dadiff.trajectory.covariance import Covariance
 from dadiff.trajectory.hankel import identity_length, minimum_length
@@ -52,7 +52,7 @@ every_orthogonal = pytest.mark.parametrize("projector", ORTHOGONAL.values(), ids
 FITTED: dict[tuple[object, int], object] = {}
 
 
-def fit(projector, system: LinearSystem):
+def fit(projector, system: Linear):
     """Fitted on a noise-free exciting recording, once for all laws."""
     key = (projector, id(system))
     if key not in FITTED:
@@ -62,16 +62,16 @@ def fit(projector, system: LinearSystem):
     return FITTED[key]
 
 
-def bind(projector, system: LinearSystem, x_init: np.ndarray, coordinates: Coordinates | None = None) -> Projection:
+def bind(projector, system: Linear, x_init: np.ndarray, coordinates: Coordinates | None = None) -> Projection:
     return fit(projector, system).bind(coordinates, pins(projector, system.layout(HORIZON), x_init))
 
 
-def scaled(system: LinearSystem, seed: int = 0) -> Coordinates:
+def scaled(system: Linear, seed: int = 0) -> Coordinates:
     rng, d = np.random.default_rng(seed), system.layout(HORIZON).size
     return Coordinates(rng.standard_normal(d), rng.uniform(0.2, 3, d))
 
 
-def close(system: LinearSystem, size: float = 1.0) -> float:
+def close(system: Linear, size: float = 1.0) -> float:
     return tolerance(size=system.layout(HORIZON).size, conditioning=CONDITIONING) * max(size, 1)
 
 
@@ -87,7 +87,7 @@ def bound(projector, system, coordinates):
     return bind(projector, system, x_init, coordinates), x_init
 
 
-def generic(system: LinearSystem, *shape: int) -> np.ndarray:
+def generic(system: Linear, *shape: int) -> np.ndarray:
     return np.random.default_rng(2).standard_normal((*shape, system.layout(HORIZON).size))
 
 
@@ -234,7 +234,7 @@ def test_known_is_F_times_its_pseudo_inverse(system):
 @pytest.mark.parametrize("initial_state", ["free", "fixed"])
 @pytest.mark.parametrize(("A", "T"), [(2.0, 60), (3.0, 700)])
 def test_known_holds_where_the_powers_of_A_overflow_every_digit(A, T, initial_state):
-    system = LinearSystem(np.array([[A]]), np.ones((1, 1)))
+    system = Linear(np.array([[A]]), np.ones((1, 1)))
     layout, z = system.layout(T), np.random.default_rng(0).standard_normal((3, 2 * T + 1))
     fitted = Known(initial_state).fit(layout, system=system)
     x, u = layout.split(fitted.bind(pins=pins(Known(initial_state), layout, np.ones((3, 1))))(z))
@@ -316,7 +316,7 @@ def test_a_recording_under_feedback_is_refused_with_its_rank_and_the_needed_one(
     """Under u = -K x the first input of a window follows from its first state, however much noise drives the rest."""
     system, layout = double_integrator(), double_integrator().layout(HORIZON)
     gain = np.array([[1.0, 0, 2, 0], [0, 1.0, 0, 2]])
-    closed = LinearSystem(system.A - system.B @ gain, system.B)
+    closed = Linear(system.A - system.B @ gain, system.B)
     rng = np.random.default_rng(0)
     noise = process_noise * rng.standard_normal((20, 40, 4))
     states = closed.simulate(rng.standard_normal((20, 4)), np.zeros((20, 40, 2)), noise)
@@ -359,7 +359,7 @@ def test_none_has_nothing_to_fit():
 # --- the two forms of a projection onto dynamics: dense matrices, and a recursion over blocks
 
 
-def varying(system: LinearSystem, horizon: int) -> Stages:
+def varying(system: Linear, horizon: int) -> Stages:
     """Stages that differ from one another, with an offset; some of them unstable."""
     rng, constant = np.random.default_rng(5), Stages.constant(system.A, system.B, None, horizon)
     A = constant.A * rng.uniform(0.7, 1.3, (horizon, 1, 1)) + 0.02 * rng.standard_normal(constant.A.shape)
@@ -425,7 +425,7 @@ class TestBothForms:
 )
 @pytest.mark.parametrize("held", [(), ("initial_state",)], ids=["free", "x(0)"])
 def test_blocks_hold_for_unstable_dynamics_and_for_such_that_no_input_moves(monkeypatch, A, B, T, held):
-    system = LinearSystem(np.array([[A]]), np.array([[B]]))
+    system = Linear(np.array([[A]]), np.array([[B]]))
     layout, z = system.layout(T), np.random.default_rng(0).standard_normal((3, 2 * T + 1))
     x_init = [getattr(Pin, name)(layout, np.ones((3, 1))) for name in held]
     dense, blocks = both_forms(monkeypatch, Stages.constant(system.A, system.B, None, T), layout, None, x_init)

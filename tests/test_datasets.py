@@ -14,7 +14,7 @@ from dadiff.datasets import Generated, NpzRecordings, NpzTrajectories
 from dadiff.datasets.cached import load_data, save_data
 from dadiff.datasets.files import read_array
 from dadiff.errors import ConfigError, DataError
-from dadiff.systems import GaussianExcitation, LinearSystem, double_integrator
+from dadiff.systems import GaussianExcitation, Linear, double_integrator
 from dadiff.tasks import LQR, Demonstrations
 from dadiff.trajectory import Channel, Layout
 
@@ -229,7 +229,7 @@ def test_a_task_with_another_condition_needs_another_data_set(folder):
 # --- recordings from files
 
 
-def record(folder: Path, name: str, system: LinearSystem = SYSTEM, length: int = 60, seed: int = 0, **changes) -> Path:
+def record(folder: Path, name: str, system: Linear = SYSTEM, length: int = 60, seed: int = 0, **changes) -> Path:
     made = GaussianExcitation(length, process_noise=0.0, seed=seed).record(system)
     folder.mkdir(exist_ok=True)
     np.savez(folder / name, **{"states": made.states[0], "controls": made.inputs[0], **changes})
@@ -268,7 +268,7 @@ def test_a_recording_needs_one_state_more_than_inputs(tmp_path):
 
 
 def test_a_fleet_has_a_folder_a_robot(tmp_path):
-    robots = LinearSystem(np.stack([SYSTEM.A] * 2), np.stack([SYSTEM.B] * 2))
+    robots = Linear(np.stack([SYSTEM.A] * 2), np.stack([SYSTEM.B] * 2), robots=2)
     record(tmp_path / "robot_0", "a.npz")
     with pytest.raises(DataError, match="no recordings for robot_1; expected one folder for each of 2 robots"):
         NpzRecordings(str(tmp_path)).record(robots)

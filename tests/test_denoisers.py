@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +21,7 @@ from dadiff.diffusion.schedule import Schedule, cosine, ddpm_linear, paper_linea
 from dadiff.errors import CheckpointError, ConfigError, ShapeError
 from dadiff.experts.lqr import closed_loop_law, optimal_feedback
 from dadiff.randomness import numpy_generator, torch_generator
-from dadiff.systems import LinearSystem, double_integrator
+from dadiff.systems import Linear, double_integrator
 from dadiff.trajectory import Channel, Layout, TrajectoryLayout
 from dadiff.trajectory.coordinates import Coordinates, physical
 
@@ -92,12 +92,14 @@ def test_posterior_mean_weights_are_the_error_of_the_reverse_mean(schedule):
 @dataclass
 class Law:
     mean_map: np.ndarray
+    offset: np.ndarray
     noise_map: np.ndarray
 
 
 def random_law(*robots: int, d: int = LAYOUT.size, sources: int = 6) -> Law:
     rng = numpy_generator(3, "law")
-    return Law(rng.standard_normal((*robots, d, ENVIRONMENT_DIM)), rng.standard_normal((*robots, d, sources)))
+    shapes = (d, ENVIRONMENT_DIM), (d,), (d, sources)
+    return Law(*(rng.standard_normal((*robots, *shape)) for shape in shapes))
 
 
 def random_coordinates() -> Coordinates:
@@ -107,7 +109,7 @@ def random_coordinates() -> Coordinates:
 
 def conditional_mean(law: Law, c: Coordinates, a: float, z: np.ndarray, E: np.ndarray) -> np.ndarray:
     """E[z_0 | z_i = sqrt(a) z_0 + sqrt(1 - a) eps], by conditioning the joint Gaussian with dense matrices."""
-    mu = (law.mean_map @ E - c.mean) / c.scale
+    mu = (law.mean_map @ E + law.offset - c.mean) / c.scale
     G = law.noise_map / c.scale[:, None]
     Sigma = G @ G.T
     return mu + np.sqrt(a) * Sigma @ np.linalg.solve(a * Sigma + (1 - a) * np.eye(len(z)), z - np.sqrt(a) * mu)
@@ -150,7 +152,7 @@ def test_exact_denoiser_in_the_limits():
 
 def test_exact_denoiser_without_noise_is_the_mean():
     law = random_law()
-    denoiser = ExactDenoiser(Law(law.mean_map, 0 * law.noise_map), physical(LAYOUT), paper_linear())
+    denoiser = ExactDenoiser(replace(law, noise_map=0 * law.noise_map), physical(LAYOUT), paper_linear())
     E = draw(ENVIRONMENT_DIM)
     np.testing.assert_array_equal(denoiser(draw(LAYOUT.size), 1, E), denoiser.mean(E))
 
@@ -160,7 +162,7 @@ def test_exact_denoiser_of_many_robots_equals_one_after_another():
     z, E = draw(3, 4, 2, LAYOUT.size), draw(3, 4, 1, ENVIRONMENT_DIM, seed=1)
     together = Gaussian().exact(law, c, schedule)(z, 20, E)
     for r in range(3):
-        alone = Gaussian().exact(Law(law.mean_map[r], law.noise_map[r]), c, schedule)(z[r], 20, E[r])
+        alone = Gaussian().exact(Law(law.mean_map[r], law.offset[r], law.noise_map[r]), c, schedule)(z[r], 20, E[r])
         np.testing.assert_allclose(together[r], alone, atol=1e-12)
 
 
@@ -323,7 +325,7 @@ def test_files_that_are_no_models(tmp_path):
 def test_a_system_of_another_size():
     """Nothing assumes four states and two inputs."""
     rng = numpy_generator(0, "system")
-    system = LinearSystem(0.5 * rng.standard_normal((3, 3)), rng.standard_normal((3, 2)), 0.1)
+    system = Linear(0.5 * rng.standard_normal((3, 3)), rng.standard_normal((3, 2)), process_noise=0.1)
     law = closed_loop_law(system, optimal_feedback(system, np.eye(3), np.eye(2), 5))
     denoiser = Gaussian().exact(law, random_coordinates(), paper_linear())
     assert denoiser(draw(4, LAYOUT.size), 10, draw(6)).shape == (4, LAYOUT.size)

@@ -26,7 +26,7 @@ from dadiff.systems import (
     DampedIntegrators,
     GaussianExcitation,
     LaggedIntegrators,
-    LinearSystem,
+    Linear,
     RotatedIntegrators,
     double_integrator,
 )
@@ -224,8 +224,8 @@ class TestBadInput:
             fleet_for(self.family).target(DampedIntegrators(damping=(0, 0), gain=(0, 0)))
 
     def test_robots_of_different_sizes(self):
-        with pytest.raises(ShapeError, match="all robots must share n and m"):
-            LinearSystem([np.eye(2), np.eye(3)], [np.ones((2, 1)), np.ones((3, 1))])
+        with pytest.raises(ShapeError, match="rows, robots and steps must be alike"):
+            Linear([np.eye(2), np.eye(3)], [np.ones((2, 1)), np.ones((3, 1))])
 
     def test_a_single_system(self):
         with pytest.raises(ConfigError, match="found a single system; choose system=damped_integrators"):
@@ -251,7 +251,7 @@ class TestBadInput:
 
     def test_an_unstable_robot(self):
         A = np.stack([np.eye(2), 1e9 * np.eye(2)])
-        system = LinearSystem(A, np.zeros((2, 2, 1)))
+        system = Linear(A, np.zeros((2, 2, 1)), robots=2)
         with pytest.raises(InfeasibleError, match="robot 1 leaves float range"):
             LQR(state_cost=(1, 1)).feedback(system)
 

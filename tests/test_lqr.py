@@ -8,68 +8,69 @@ import pytest
 from laws import fleet, members
 
 from dadiff.errors import ConfigError, InfeasibleError
-from dadiff.experts.lqr import closed_loop_law, optimal_feedback, stationary_feedback
+from dadiff.evaluation import replay
+from dadiff.experts.lqr import closed_loop_law, follow, optimal_feedback, stationary_feedback
 from dadiff.randomness import numpy_generator
-from dadiff.systems import LinearSystem, double_integrator
+from dadiff.systems import AffineSystem, Linear, double_integrator
 from dadiff.tasks import LQR
 from dadiff.trajectory.response import along
 
 
-def task_for(system: LinearSystem, horizon: int = 12, **options) -> LQR:
+def task_for(system: Linear, horizon: int = 12, **options) -> LQR:
     return LQR(horizon=horizon, state_cost=tuple(np.linspace(10, 1, system.state_dim)), **options)
 
 
-def optimum(system: LinearSystem, task: LQR, count: int = 3) -> tuple[np.ndarray, np.ndarray]:
+def optimum(system: Linear, task: LQR, count: int = 3) -> tuple[np.ndarray, np.ndarray]:
     """(environment, noise-free optimal trajectories) of a few cases."""
     cases = task.cases(system, count, numpy_generator(0, "test"))
     return cases.environment, cases.reference
 
 
-def follow(system: LinearSystem, feedback, x_init: np.ndarray, target: np.ndarray) -> np.ndarray:
-    x, states, inputs = x_init, [x_init], []
-    for t in range(feedback.horizon):
-        inputs.append(feedback.K[t] @ x + feedback.L[t] @ target)
-        x = system.A @ x + system.B @ inputs[-1]
-        states.append(x)
-    return system.layout(feedback.horizon).flatten(np.array(states), np.array(inputs))
-
-
-def test_the_affine_optimum_is_the_qps(system):
-    task = task_for(system)
-    (environment,), (tau,) = optimum(system, task, count=1)
+def by_qp(system: AffineSystem, task: LQR, E: np.ndarray):
+    """States, inputs and cost of the optimum for one E by a solver of quadratic programs."""
     n, T = system.state_dim, task.horizon
     x, u = cp.Variable((T + 1, n)), cp.Variable((T, system.input_dim))
-    weights = np.sqrt(np.diag(task.Q))
-    cost = cp.sum_squares(cp.multiply(x[:-1] - environment[None, n:], weights[None])) + cp.sum_squares(u)
-    dynamics = [x[0] == environment[:n], x[1:] == x[:-1] @ system.A.T + u @ system.B.T]
+    root = np.linalg.cholesky(task.R(system))
+    deviation = x[:-1] - E[None, n:]
+    cost = cp.sum_squares(cp.multiply(deviation, np.sqrt(np.diag(task.Q))[None])) + cp.sum_squares(u @ root)
+    A, B, c = system.matrices(T)
+    dynamics = [x[0] == E[:n], *(x[t + 1] == A[t] @ x[t] + B[t] @ u[t] + c[t] for t in range(T))]
     problem = cp.Problem(cp.Minimize(cost), dynamics)
     problem.solve(solver=cp.CLARABEL, tol_gap_abs=1e-12, tol_gap_rel=1e-12, tol_feas=1e-12)
-    states, inputs = system.layout(T).split(tau)
-    np.testing.assert_allclose(states, x.value, atol=1e-6)
-    np.testing.assert_allclose(inputs, u.value, atol=1e-6)
-    np.testing.assert_allclose(task.cost(system, tau, environment[n:]), problem.value, rtol=1e-8)
+    return x.value, u.value, problem.value
 
 
-def test_the_gradient_of_the_cost_vanishes_at_the_optimum(system):
-    """With lambda(t) = 2 Q (x(t) - target) + A' lambda(t+1), lambda(T) = 0: 2 R u(t) + B' lambda(t+1) = 0."""
-    task = task_for(system)
-    environment, tau = optimum(system, task)
-    states, inputs = system.layout(task.horizon).split(tau)
+def test_the_affine_optimum_is_the_qps(affine):
+    task = task_for(affine)
+    (environment,), (tau,) = optimum(affine, task, count=1)
+    states, inputs = affine.layout(task.horizon).split(tau)
+    x, u, cost = by_qp(affine, task, environment)
+    np.testing.assert_allclose(states, x, atol=1e-6)
+    np.testing.assert_allclose(inputs, u, atol=1e-6)
+    np.testing.assert_allclose(task.cost(affine, tau, environment[affine.state_dim :]), cost, rtol=1e-8)
+
+
+def test_the_gradient_of_the_cost_vanishes_at_the_optimum(affine):
+    """With lambda(t) = 2 Q (x(t) - target) + A_t' lambda(t+1), lambda(T) = 0: 2 R u(t) + B_t' lambda(t+1) = 0."""
+    task = task_for(affine)
+    environment, tau = optimum(affine, task)
+    A, B, _ = affine.matrices(task.horizon)
+    states, inputs = affine.layout(task.horizon).split(tau)
     multiplier = np.zeros_like(states[:, 0])
     for t in reversed(range(task.horizon)):
-        gradient = 2 * inputs[:, t] @ task.R(system) + multiplier @ system.B
+        gradient = 2 * inputs[:, t] @ task.R(affine) + multiplier @ B[t]
         np.testing.assert_allclose(gradient, 0, atol=1e-10 * max(1, np.abs(multiplier).max()))
-        multiplier = 2 * (states[:, t] - environment[:, system.state_dim :]) @ task.Q + multiplier @ system.A
+        multiplier = 2 * (states[:, t] - environment[:, affine.state_dim :]) @ task.Q + multiplier @ A[t]
 
 
-def test_the_last_input_is_0_since_nothing_costs_at_T(system):
-    task = task_for(system)
-    _, tau = optimum(system, task)
-    assert np.abs(system.layout(task.horizon).inputs(tau)[:, -1]).max() < 1e-14
+def test_the_last_input_is_0_since_nothing_costs_at_T(affine):
+    task = task_for(affine)
+    _, tau = optimum(affine, task)
+    assert np.abs(affine.layout(task.horizon).inputs(tau)[:, -1]).max() < 1e-14
 
 
-def test_no_perturbation_of_the_inputs_is_cheaper(system, rng):
-    task = task_for(system)
+def test_no_perturbation_of_the_inputs_is_cheaper(affine, rng):
+    system, task = affine, task_for(affine)
     environment, tau = optimum(system, task)
     layout, target = system.layout(task.horizon), environment[:, system.state_dim :]
     best = task.cost(system, tau, target)
@@ -106,7 +107,7 @@ def test_a_fleet_is_its_robots_one_by_one(solve):
 
 
 def test_a_horizon_that_overflows_is_an_infeasible_problem():
-    system = LinearSystem([[1e200]], [[1e-200]])
+    system = Linear([[1e200]], [[1e-200]])
     with pytest.raises(
         InfeasibleError, match="the Riccati recursion of the system leaves float range over horizon T = 9"
     ):
@@ -116,19 +117,38 @@ def test_a_horizon_that_overflows_is_an_infeasible_problem():
 # --- the law
 
 
-def test_the_mean_is_the_closed_loop_without_noise(system):
-    task = task_for(system)
-    environment, tau = optimum(system, task)
-    for E, expected in zip(environment, tau, strict=True):
-        x_init, target = np.split(E, 2)
-        np.testing.assert_allclose(follow(system, task.feedback(system), x_init, target), expected, atol=1e-11)
+def test_the_mean_is_the_closed_loop_without_noise(affine):
+    task = task_for(affine)
+    environment, tau = optimum(affine, task)
+    E = task.condition(affine).unpack(environment)
+    followed = follow(affine, task.feedback(affine), E["x_init"], E["target"])
+    np.testing.assert_allclose(followed, tau, atol=1e-10)
 
 
-def test_demonstrations_have_the_laws_mean_and_covariance(system):
+def test_the_law_is_the_closed_loop_under_noise(affine, rng):
+    """Entry by entry: unit noise through `noise_map` is w through the closed loop."""
+    task = task_for(affine)
+    law, E = task.law(affine), rng.standard_normal((5, 2 * affine.state_dim))
+    unit = rng.standard_normal((5, task.horizon, affine.state_dim))
+    ends = task.condition(affine).unpack(E)
+    noisy = follow(affine, task.feedback(affine), ends["x_init"], ends["target"], affine.process_noise * unit)
+    np.testing.assert_allclose(law.mean(E) + along(law.noise_map, unit.reshape(5, -1)), noisy, atol=1e-10)
+
+
+def test_a_plan_of_the_expert_is_its_replay(affine):
+    """Whatever varies or is added: the inputs, applied from x_init, give the states."""
+    task = task_for(affine)
+    cases = task.cases(affine, 3, numpy_generator(0, "test"))
+    layout, plans = affine.layout(task.horizon), cases.reference[:, None]
+    np.testing.assert_allclose(replay(affine, layout, plans, cases.x_init), plans, atol=1e-10)
+
+
+def test_demonstrations_have_the_laws_mean_and_covariance(affine):
+    system = affine
     task, law = task_for(system, horizon=4), task_for(system, horizon=4).law(system)
     count = 20_000
     demonstrations = task.demonstrations(system, count, numpy_generator(0, "test"))
-    deviation = demonstrations.trajectories - along(law.mean_map, demonstrations.environment)
+    deviation = demonstrations.trajectories - law.mean(demonstrations.environment)
     sigma = np.sqrt(np.diag(law.covariance))
     assert (np.abs(deviation.mean(axis=0)) <= 5 * sigma / np.sqrt(count) + 1e-12).all()
     spread = np.outer(sigma, sigma)

@@ -13,7 +13,7 @@ from dadiff.experts.compiling import compiled
 from dadiff.experts.obstacles import batched, kernels
 from dadiff.experts.obstacles.problem import ObstacleProblem, time_step_of
 from dadiff.experts.obstacles.quadratic import obstacle_free
-from dadiff.systems import LinearSystem, double_integrator
+from dadiff.systems import Linear, double_integrator
 from dadiff.tasks.obstacles import Obstacles
 
 
@@ -227,10 +227,10 @@ def test_what_does_not_converge_is_said(monkeypatch: pytest.MonkeyPatch) -> None
     [
         double_integrator(axes=1),
         double_integrator(discretisation="zoh"),
-        LinearSystem(np.eye(4), np.zeros((4, 2))),
+        Linear(np.eye(4), np.zeros((4, 2))),
     ],
 )
-def test_other_systems_are_refused(system: LinearSystem) -> None:
+def test_other_systems_are_refused(system: Linear) -> None:
     with pytest.raises(ConfigError, match="planar double integrator by forward Euler"):
         time_step_of(system)
 

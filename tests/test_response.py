@@ -4,42 +4,53 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from laws import fleet, members, tolerance
+from laws import fleet, members, tolerance, varying_system
 
-from dadiff.trajectory.response import along, forced_response, free_response, powers
+from dadiff.trajectory.response import along, dynamics_matrix, forced_response, free_response
 
 HORIZON = 7
 
 
 @pytest.mark.parametrize("horizon", [1, 2, HORIZON])
-def test_the_trajectory_map_is_the_roll_out(system, rng, horizon):
-    layout = system.layout(horizon)
+def test_the_trajectory_map_and_the_offset_are_the_roll_out(affine, rng, horizon):
+    system, layout = affine, affine.layout(horizon)
     x_init = rng.standard_normal((5, layout.state_dim))
     inputs = rng.standard_normal((5, horizon, layout.input_dim))
     tau = layout.flatten(system.simulate(x_init, inputs), inputs)
     sources = np.concatenate([x_init, inputs.reshape(5, -1)], axis=-1)
-    mapped = sources @ system.trajectory_map(horizon).T
+    mapped = sources @ system.trajectory_map(horizon).T + system.offset(horizon)
     np.testing.assert_allclose(mapped, tau, atol=tolerance(size=layout.size) * np.abs(tau).max())
 
 
-def test_a_roll_out_satisfies_the_dynamics_step_by_step(system, rng):
+def test_the_dynamics_matrix_gives_the_offset(affine, rng):
+    """G tau = [c_0; ...; c_{T-1}] of every roll-out, and of nothing else: it has full row rank."""
+    x_init, inputs = rng.standard_normal(affine.state_dim), rng.standard_normal((HORIZON, affine.input_dim))
+    A, B, c = affine.matrices(HORIZON)
+    G, tau = dynamics_matrix(A, B), affine.layout(HORIZON).flatten(affine.simulate(x_init, inputs), inputs)
+    np.testing.assert_allclose(G @ tau, c.ravel(), atol=1e-12)
+    assert np.linalg.matrix_rank(G) == len(G) == HORIZON * affine.state_dim
+
+
+def test_a_roll_out_satisfies_the_dynamics_step_by_step(affine, rng):
+    system = affine
     x_init, inputs = rng.standard_normal(system.state_dim), rng.standard_normal((HORIZON, system.input_dim))
     noise = rng.standard_normal((HORIZON, system.state_dim))
     x = system.simulate(x_init, inputs, noise)
     assert np.array_equal(x[0], x_init)
     for t in range(HORIZON):
-        np.testing.assert_allclose(x[t + 1], system.A @ x[t] + system.B @ inputs[t] + noise[t], atol=1e-13)
+        A, B, c = system.at(t)
+        np.testing.assert_allclose(x[t + 1], A @ x[t] + B @ inputs[t] + c + noise[t], atol=1e-13)
 
 
 def test_responses_are_made_of_powers(system):
     A, B = system.A, system.B
     n, m = B.shape
-    P = powers(A, HORIZON)
-    free = free_response(A, HORIZON).reshape(HORIZON + 1, n, n)
-    forced = forced_response(A, B, HORIZON).reshape(HORIZON + 1, n, HORIZON, m)
+    stacked_A, stacked_B, _ = system.matrices(HORIZON)
+    P = [np.linalg.matrix_power(A, t) for t in range(HORIZON + 1)]
+    free = free_response(stacked_A).reshape(HORIZON + 1, n, n)
+    forced = forced_response(stacked_A, stacked_B).reshape(HORIZON + 1, n, HORIZON, m)
     for t in range(HORIZON + 1):
-        np.testing.assert_allclose(P[t], np.linalg.matrix_power(A, t), atol=1e-12)
-        assert np.array_equal(free[t], P[t])
+        np.testing.assert_allclose(free[t], P[t], atol=1e-12)
         for s in range(HORIZON):
             np.testing.assert_allclose(forced[t, :, s], P[t - 1 - s] @ B if s < t else 0 * B, atol=1e-13)
 
@@ -50,17 +61,19 @@ def test_the_trajectory_map_has_full_column_rank(system):
     assert np.linalg.matrix_rank(F) == system.layout(HORIZON).rank
 
 
-def test_a_fleet_is_its_robots_one_by_one(rng):
-    robots = fleet()
+@pytest.mark.parametrize("robots", [fleet(), varying_system(3, 2, 12, 0, 3)], ids=["linear", "time-varying"])
+def test_a_fleet_is_its_robots_one_by_one(robots, rng):
     x_init, inputs = rng.standard_normal((3, 5, 3)), rng.standard_normal((3, 5, HORIZON, 2))
     noise = rng.standard_normal((3, 5, HORIZON, 3))
     together, F = robots.simulate(x_init, inputs, noise), robots.trajectory_map(HORIZON)
     for k, robot in enumerate(members(robots)):
         np.testing.assert_allclose(together[k], robot.simulate(x_init[k], inputs[k], noise[k]), atol=1e-13)
         np.testing.assert_allclose(F[k], robot.trajectory_map(HORIZON), atol=1e-13)
+        np.testing.assert_allclose(robots.offset(HORIZON)[k], robot.offset(HORIZON), atol=1e-13)
 
 
-def test_one_initial_state_serves_many_inputs(system, rng):
+def test_one_initial_state_serves_many_inputs(affine, rng):
+    system = affine
     x_init = rng.standard_normal((4, 1, system.state_dim))
     inputs = rng.standard_normal((4, 6, HORIZON, system.input_dim))
     states = system.simulate(x_init, inputs)
@@ -77,8 +90,8 @@ def test_along_multiplies_every_vector(rng, lead, between):
 
 
 def test_values_that_leave_float_range_stay_visible():
-    from dadiff.systems import LinearSystem
+    from dadiff.systems import Linear
 
-    states = LinearSystem([[1e200]], [[1.0]]).simulate(np.ones(1), np.zeros((3, 1)))
+    states = Linear([[1e200]], [[1.0]]).simulate(np.ones(1), np.zeros((3, 1)))
     assert np.isfinite(states[1]).all()
     assert not np.isfinite(states[2:]).any()

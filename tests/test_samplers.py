@@ -19,7 +19,7 @@ from dadiff.diffusion.samplers import DDIM, DDPM, skipped_weight
 from dadiff.diffusion.schedule import Schedule, cosine, paper_linear
 from dadiff.errors import ConfigError
 from dadiff.randomness import torch_generator
-from dadiff.systems import LinearSystem
+from dadiff.systems import Linear
 from dadiff.tasks import LQR
 from dadiff.trajectory.coordinates import physical
 
@@ -33,19 +33,19 @@ every_sampler = pytest.mark.parametrize("sampler", SAMPLERS.values(), ids=SAMPLE
 every_schedule = pytest.mark.parametrize("schedule", SCHEDULES.values(), ids=SCHEDULES.keys())
 
 
-def lqr(system: LinearSystem) -> LQR:
+def lqr(system: Linear) -> LQR:
     return LQR(horizon=HORIZON, state_cost=(1.0,) * system.state_dim)
 
 
-def exact(system: LinearSystem, schedule: Schedule) -> ExactDenoiser:
+def exact(system: Linear, schedule: Schedule) -> ExactDenoiser:
     return ExactDenoiser(lqr(system).law(system), physical(system.layout(HORIZON)), schedule)
 
 
-def one_environment(system: LinearSystem, plans: int) -> torch.Tensor:
+def one_environment(system: Linear, plans: int) -> torch.Tensor:
     return torch.linspace(-1, 1, 2 * system.state_dim, dtype=torch.float64).repeat(plans, 1)
 
 
-def draw(sampler, schedule: Schedule, system: LinearSystem, plans: int = 3, seed: int = 0, **options) -> Samples:
+def draw(sampler, schedule: Schedule, system: Linear, plans: int = 3, seed: int = 0, **options) -> Samples:
     environment = one_environment(system, plans)
     shape = (plans, system.layout(HORIZON).size)
     return sample(
@@ -191,7 +191,7 @@ def test_with_the_exact_denoiser_plans_have_the_laws_mean_and_covariance(sampler
     np.testing.assert_allclose(covariance, law.covariance, atol=0.03 * np.abs(law.covariance).max())
 
 
-def chain_law(sampler, schedule: Schedule, system: LinearSystem) -> tuple[np.ndarray, np.ndarray]:
+def chain_law(sampler, schedule: Schedule, system: Linear) -> tuple[np.ndarray, np.ndarray]:
     """Mean and covariance of tau_0, from one chain without noise and the propagation of what noise each step adds."""
     denoise, d = exact(system, schedule), system.layout(HORIZON).size
     environment = one_environment(system, d + 1)

@@ -4,12 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from laws import fleet, members, tolerance
+from laws import AFFINE, fleet, members, tolerance, varying_system
 from scipy.linalg import expm
 
 from dadiff.behaviours import Transitions, least_squares
 from dadiff.errors import ConfigError, ExcitationError, ShapeError
-from dadiff.systems import GaussianExcitation, LinearSystem, Recording, double_integrator
+from dadiff.systems import (
+    Bounds,
+    GaussianExcitation,
+    Linear,
+    Recording,
+    System,
+    TimeVarying,
+    double_integrator,
+)
 
 
 def test_A_and_B_are_the_papers():
@@ -35,12 +43,120 @@ def test_zero_order_hold_is_the_matrix_exponential(axes):
         (np.ones((2, 3)), np.ones((2, 1)), r"A has shape \(2, 3\)"),
         (np.eye(3), np.ones((2, 1)), r"B \(2, 1\)"),
         (np.eye(2), np.ones(2), r"B \(2,\)"),
-        (np.ones((5, 2, 2)), np.ones((4, 2, 1)), r"expected \(\.\.\., n, n\) and \(\.\.\., n, m\)"),
+        ([[1, 0], [1]], np.ones((2, 1)), r"parts of A have shapes \[\(1,\), \(2,\)\]"),
+        (1.0, 1.0, r"A has shape \(\); a Linear system has \(n, n\)"),
     ],
 )
 def test_matrices_that_do_not_fit_are_refused(A, B, message):
     with pytest.raises(ShapeError, match=message):
-        LinearSystem(A, B)
+        Linear(A, B)
+
+
+def test_sizes_of_a_fleet_must_agree():
+    with pytest.raises(ShapeError, match=r"expected \(5, n, n\), \(5, n, m\) and \(5, n\)"):
+        Linear(np.ones((5, 2, 2)), np.ones((4, 2, 1)), robots=5)
+    with pytest.raises(ShapeError, match=r"c \(3,\); expected \(n, n\), \(n, m\) and \(n\)"):
+        Linear(np.eye(2), np.ones((2, 1)), np.ones(3))
+
+
+def test_a_fleet_and_a_system_that_varies_are_told_apart_by_type():
+    A, B = np.ones((30, 4, 4)), np.ones((30, 4, 2))
+    with pytest.raises(ShapeError, match=r"for 30 robots give robots=30, .* T = 30 steps use TimeVarying"):
+        Linear(A, B)
+    with pytest.raises(ShapeError, match=r"robots=R \(R, T, n, n\), here robots is 30; .* use Linear with robots=R"):
+        TimeVarying(A, B, robots=30)
+    with pytest.raises(ShapeError, match=r"robots is None; .* use Linear"):
+        TimeVarying(A[None], B[None])
+    with pytest.raises(ShapeError, match="use TimeVarying"):
+        Linear(A[None], B[None], robots=1)
+    assert (Linear(A, B, robots=30).robots, TimeVarying(A, B).robots) == ((30,), ())
+    assert TimeVarying(A[None], B[None], robots=1).robots == (1,)
+
+
+def test_a_system_that_varies_ends_where_its_matrices_end(rng):
+    system = varying_system(3, 2, 5, seed=0)
+    x_init, inputs = rng.standard_normal(3), rng.standard_normal((6, 2))
+    system.simulate(x_init, inputs[:5])
+    for ask in (lambda: system.simulate(x_init, inputs), lambda: system.matrices(6)):
+        with pytest.raises(ShapeError, match=r"given for steps 0\.\.4, asked for step 5"):
+            ask()
+
+
+ALL = {**AFFINE, "fleet": fleet(), "time-varying fleet": varying_system(3, 2, 12, 3, 4)}
+
+
+@pytest.mark.parametrize("system", ALL.values(), ids=ALL.keys())
+def test_steps_linearisations_and_simulations_agree(system, rng):
+    """For a batch of points at one time, and for trajectories at times 0..T-1."""
+    n, m, T = system.state_dim, system.input_dim, 6
+    x_init, inputs = rng.standard_normal((*system.robots, 5, n)), rng.standard_normal((*system.robots, 5, T, m))
+    x = system.simulate(x_init, inputs)
+    assert x.shape == (*system.robots, 5, T + 1, n)
+    np.testing.assert_allclose(System.simulate(system, x_init, inputs), x, atol=1e-12)
+    np.testing.assert_allclose(system.step(x[..., :-1, :], inputs, np.arange(T)), x[..., 1:, :], atol=1e-12)
+    A, B, c = system.linearise(x[..., :-1, :], inputs, np.arange(T))
+    assert (A.shape, B.shape, c.shape) == ((*x[..., 1:, :].shape, n), (*inputs.shape[:-1], n, m), x[..., 1:, :].shape)
+    following = (A @ x[..., :-1, :, None] + B @ inputs[..., None])[..., 0] + c
+    np.testing.assert_allclose(following, x[..., 1:, :], atol=1e-12)
+    for t in (0, T - 1):
+        A, B, c = system.linearise(x[..., t, :], inputs[..., t, :], t)
+        one = (A @ x[..., t, :, None] + B @ inputs[..., t, :, None])[..., 0] + c
+        np.testing.assert_allclose(one, x[..., t + 1, :], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("description", "error", "message"),
+    [
+        (
+            {"process_noise": [0.1, 0.2, 0.3]},
+            ShapeError,
+            r"process_noise has shape \(3,\); expected",
+        ),
+        ({"process_noise": [0.1, -0.2]}, ConfigError, "process_noise"),
+        ({"time_step": 0.0}, ConfigError, "time_step is 0"),
+        ({"state_names": ("a",)}, ShapeError, "1 labels for 2 entries"),
+        ({"input_units": ("N", "N")}, ShapeError, "2 units for 1 entries"),
+        (
+            {"bounds": Bounds(input_low=[0.0, 0.0])},
+            ShapeError,
+            r"input_low has shape \(2,\); expected",
+        ),
+    ],
+)
+def test_what_does_not_describe_a_system_is_refused(description, error, message):
+    with pytest.raises(error, match=message):
+        Linear(np.eye(2), np.ones((2, 1)), **description)
+
+
+def test_bounds():
+    bounds = Bounds(input_high=3.0, state_low=[-1.0, -np.inf])
+    low, high = bounds.of_states(2)
+    assert low.tolist() == [-1, -np.inf]
+    assert high.tolist() == [np.inf, np.inf]
+    assert bounds.of_inputs(2)[1].tolist() == [3, 3]
+    assert bounds.any
+    assert not Bounds().any
+    with pytest.raises(ConfigError, match=r"input_low is 1.0, input_high -1.0; need low <= high"):
+        Bounds(input_low=1.0, input_high=-1.0)
+
+
+def test_names_and_units_reach_the_layout():
+    system = Linear(np.eye(2), np.ones((2, 1)), state_names=("p", "v"), state_units=("m", "m/s"), input_names=("f",))
+    layout = system.layout(3)
+    assert layout.channel("x").labels == ("p", "v")
+    assert layout.channel("x").units == ("m", "m/s")
+    assert layout.channel("u").labels == ("f",)
+    assert layout == Linear(np.eye(2), np.ones((2, 1))).layout(3)
+
+
+def test_noise_of_each_state():
+    system = Linear(np.eye(2), np.ones((2, 1)), process_noise=[0.0, 2.0])
+    drawn = system.noise((4000,), np.random.default_rng(0))
+    assert (drawn[:, 0] == 0).all()
+    np.testing.assert_allclose(drawn[:, 1].std(), 2, rtol=0.05)
+    recording = GaussianExcitation(length=50, input_std=0.0).record(system)
+    assert (recording.states[..., 0] == 0).all()
+    assert recording.states[..., 1].std() > 0
 
 
 @pytest.mark.parametrize(
@@ -52,7 +168,7 @@ def test_matrices_that_do_not_fit_are_refused(A, B, message):
         lambda: double_integrator(process_noise=-0.1),
         lambda: double_integrator(process_noise=float("nan")),
         lambda: double_integrator(process_noise=float("inf")),
-        lambda: LinearSystem([[np.nan]], [[1.0]]),
+        lambda: Linear([[np.nan]], [[1.0]]),
         lambda: GaussianExcitation(length=0),
         lambda: GaussianExcitation(count=0),
         lambda: GaussianExcitation(input_std=float("nan")),

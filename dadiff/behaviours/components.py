@@ -16,7 +16,7 @@ from dadiff.behaviours.pins import Pin
 from dadiff.behaviours.sets import Dynamics, Everything, InitialState, Rollout, Span, TrajectorySet
 from dadiff.behaviours.stages import stages_of
 from dadiff.errors import ConfigError, ExcitationError
-from dadiff.systems import LinearSystem, Recording
+from dadiff.systems import Recording, System
 from dadiff.trajectory.hankel import identity_length, trajectory_matrix
 from dadiff.trajectory.layout import TrajectoryLayout
 from dadiff.trajectory.subspace import numerical_rank, rank_tolerance
@@ -39,7 +39,7 @@ class Projector(Protocol):
     def fit(
         self,
         layout: TrajectoryLayout,
-        system: LinearSystem | None = None,
+        system: System | None = None,
         recording: Recording | None = None,
         demonstrations: np.ndarray | None = None,
     ) -> TrajectorySet | None:
@@ -66,7 +66,7 @@ class NoProjector:
     def fit(
         self,
         layout: TrajectoryLayout,
-        system: LinearSystem | None = None,
+        system: System | None = None,
         recording: Recording | None = None,
         demonstrations: np.ndarray | None = None,
     ) -> None:
@@ -83,7 +83,7 @@ class Inpainting:
     def fit(
         self,
         layout: TrajectoryLayout,
-        system: LinearSystem | None = None,
+        system: System | None = None,
         recording: Recording | None = None,
         demonstrations: np.ndarray | None = None,
     ) -> Everything:
@@ -105,7 +105,7 @@ class Known:
     def fit(
         self,
         layout: TrajectoryLayout,
-        system: LinearSystem | None = None,
+        system: System | None = None,
         recording: Recording | None = None,
         demonstrations: np.ndarray | None = None,
     ) -> Dynamics:
@@ -129,7 +129,7 @@ class Hankel:
     def fit(
         self,
         layout: TrajectoryLayout,
-        system: LinearSystem | None = None,
+        system: System | None = None,
         recording: Recording | None = None,
         demonstrations: np.ndarray | None = None,
     ) -> Span:
@@ -158,7 +158,7 @@ class HankelLowRank:
     def fit(
         self,
         layout: TrajectoryLayout,
-        system: LinearSystem | None = None,
+        system: System | None = None,
         recording: Recording | None = None,
         demonstrations: np.ndarray | None = None,
     ) -> Span:
@@ -191,7 +191,7 @@ class Identified:
     def fit(
         self,
         layout: TrajectoryLayout,
-        system: LinearSystem | None = None,
+        system: System | None = None,
         recording: Recording | None = None,
         demonstrations: np.ndarray | None = None,
     ) -> Dynamics:
@@ -211,7 +211,7 @@ class RolloutProjector:
     def fit(
         self,
         layout: TrajectoryLayout,
-        system: LinearSystem | None = None,
+        system: System | None = None,
         recording: Recording | None = None,
         demonstrations: np.ndarray | None = None,
     ) -> Rollout:
@@ -223,7 +223,7 @@ class RolloutProjector:
 def transitions(
     projector: Identified,
     layout: TrajectoryLayout,
-    system: LinearSystem | None,
+    system: System | None,
     recording: Recording | None,
     demonstrations: np.ndarray | None,
 ) -> Transitions:
@@ -249,7 +249,7 @@ def transitions(
     return found[0] if len(found) == 1 else found[0] + found[1]
 
 
-def known_offset(projector: Identified, system: LinearSystem | None) -> np.ndarray | None:
+def known_offset(projector: Identified, system: System | None) -> np.ndarray | None:
     """c of the system (*robots, n), where the projector is told it."""
     if projector.offset != "known":
         return None

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from dadiff.errors import ConfigError, ShapeError
-from dadiff.systems import LinearSystem
+from dadiff.systems import System, require_affine
 from dadiff.trajectory.arrays import Array, contiguous, join, stack
 from dadiff.trajectory.layout import TrajectoryLayout
 
@@ -86,9 +86,9 @@ class Stages:
         return stack(states, -2)
 
 
-def stages_of(system: LinearSystem, horizon: int) -> Stages:
-    """The stages of a linear system over T inputs."""
-    return Stages.constant(system.A, system.B, None, horizon)
+def stages_of(system: System, horizon: int) -> Stages:
+    """The stages of a linear system, which may vary in time, over T inputs."""
+    return Stages(*require_affine(system, "projector").matrices(horizon))
 
 
 def by_plan(layout: TrajectoryLayout, states: Array, inputs: Array) -> Array:

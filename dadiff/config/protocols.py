@@ -16,7 +16,7 @@ from typing import Any, get_type_hints
 from dadiff.errors import ConfigError
 
 PROTOCOLS: Mapping[str, tuple[str, ...]] = {
-    "system": ("dadiff.systems.LinearSystem", "dadiff.systems.Family"),
+    "system": ("dadiff.systems.System", "dadiff.systems.Family"),
     "task": ("dadiff.tasks.Task",),
     "dataset": ("dadiff.datasets.generated.Dataset",),
     "recording": ("dadiff.systems.recording.Recorder",),

@@ -19,7 +19,7 @@ import numpy as np
 
 from dadiff.datasets.generated import Part
 from dadiff.errors import ConfigError, DataError
-from dadiff.systems import LinearSystem, Recording
+from dadiff.systems import Recording, System
 from dadiff.tasks import Cases, Demonstrations, Task
 
 INPUT_NAMES = ("inputs", "controls")
@@ -132,18 +132,18 @@ class NpzTrajectories:
         list_files(folder := Path(self.path) / part)
         return {"content": fingerprint(folder), "size": self.train_size if part == "train" else self.test_size}
 
-    def train(self, task: Task, system: LinearSystem) -> Demonstrations:
+    def train(self, task: Task, system: System) -> Demonstrations:
         """The trajectories of `path`/train."""
         tau, environment = self._read("train", task, system, self.train_size)
         return Demonstrations(tau, environment)
 
-    def test(self, task: Task, system: LinearSystem) -> Cases:
+    def test(self, task: Task, system: System) -> Cases:
         """The cases of `path`/test."""
         tau, environment = self._read("test", task, system, self.test_size)
         return Cases(task.condition(system), environment, tau)
 
-    def _read(self, part: str, task: Task, system: LinearSystem, count: int | None) -> tuple[np.ndarray, np.ndarray]:
-        if not isinstance(system, LinearSystem) or system.robots:
+    def _read(self, part: str, task: Task, system: System, count: int | None) -> tuple[np.ndarray, np.ndarray]:
+        if not isinstance(system, System) or system.robots:
             raise ConfigError("dataset: npz trajectories belong to one system, and here are several robots")
         n, m, T = system.state_dim, system.input_dim, task.horizon
         condition = task.condition(system)
@@ -183,7 +183,7 @@ class NpzRecordings:
             list_files(Path(self.path))
         return fingerprint(Path(self.path))
 
-    def record(self, system: LinearSystem) -> Recording:
+    def record(self, system: System) -> Recording:
         """All files side by side.
 
         Raises:
@@ -192,7 +192,7 @@ class NpzRecordings:
         """
         if not system.robots:
             return self._read(Path(self.path), system)
-        folders = [Path(self.path) / f"robot_{k}" for k in range(len(system.A))]
+        folders = [Path(self.path) / f"robot_{k}" for k in range(system.robots[0])]
         if missing := [folder.name for folder in folders if not folder.is_dir()]:
             raise DataError(
                 f"{self.path}: no recordings for {', '.join(missing)}; expected one folder for each of "
@@ -207,7 +207,7 @@ class NpzRecordings:
                 )
         return Recording(*(np.stack([getattr(r, part) for r in recordings]) for part in ("states", "inputs")))
 
-    def _read(self, folder: Path, system: LinearSystem) -> Recording:
+    def _read(self, folder: Path, system: System) -> Recording:
         files = list_files(folder)
         inputs = [read_array(f, INPUT_NAMES, (None, system.input_dim)) for f in files]
         for file, u in zip(files, inputs, strict=True):

@@ -7,7 +7,7 @@ from typing import Any, Literal, Protocol, get_args, runtime_checkable
 
 from dadiff.errors import ConfigError
 from dadiff.randomness import numpy_generator
-from dadiff.systems import Family, LinearSystem
+from dadiff.systems import Family, System
 from dadiff.tasks import Cases, Demonstrations, Task
 
 Part = Literal["train", "test"]
@@ -22,11 +22,11 @@ class Dataset(Protocol):
         """What a part depends on, for its key: sizes and seeds, or what files hold."""
         ...
 
-    def train(self, task: Task, system: LinearSystem | Family) -> Demonstrations:
+    def train(self, task: Task, system: System | Family) -> Demonstrations:
         """The demonstrations."""
         ...
 
-    def test(self, task: Task, system: LinearSystem) -> Cases:
+    def test(self, task: Task, system: System) -> Cases:
         """The test cases with their references."""
         ...
 
@@ -53,10 +53,10 @@ class Generated:
         """What the demonstrations or the cases depend on."""
         return {"generated": self.train_size if part == "train" else self.test_size, "seed": self.seed}
 
-    def train(self, task: Task, system: LinearSystem | Family) -> Demonstrations:
+    def train(self, task: Task, system: System | Family) -> Demonstrations:
         """`train_size` demonstrations."""
         return task.demonstrations(system, self.train_size, numpy_generator(self.seed, "demonstrations"))
 
-    def test(self, task: Task, system: LinearSystem) -> Cases:
+    def test(self, task: Task, system: System) -> Cases:
         """`test_size` cases."""
         return task.cases(system, self.test_size, numpy_generator(self.seed, "cases"))

@@ -11,7 +11,7 @@ from dadiff.datasets.environments import load_environments
 from dadiff.datasets.generated import Generated, Part
 from dadiff.errors import ConfigError, DataError
 from dadiff.experts.obstacles.problem import time_step_of
-from dadiff.systems import LinearSystem
+from dadiff.systems import System
 from dadiff.tasks import Cases, Demonstrations, Task
 from dadiff.tasks.obstacles import Obstacles
 
@@ -45,11 +45,11 @@ class OwnEnvironments:
             raise DataError(f"{file}: no such file; set dataset.path to a yaml or npz file of environments")
         return {"content": hashlib.sha256(file.read_bytes()).hexdigest()[:16]}
 
-    def train(self, task: Task, system: LinearSystem) -> Demonstrations:
+    def train(self, task: Task, system: System) -> Demonstrations:
         """Generated demonstrations."""
         return self.generated.train(task, system)
 
-    def test(self, task: Task, system: LinearSystem) -> Cases:
+    def test(self, task: Task, system: System) -> Cases:
         """The file's environments, with the expert's solutions as references."""
         if not isinstance(task, Obstacles):
             raise ConfigError(

@@ -14,14 +14,20 @@ from torch import Tensor
 from dadiff.diffusion.schedule import Schedule
 from dadiff.errors import ShapeError
 from dadiff.trajectory.coordinates import Coordinates
-from dadiff.trajectory.response import along
+from dadiff.trajectory.response import along, beside
 
 
 class Law(Protocol):
-    """tau | E ~ N(mean_map E, noise_map noise_map'): mean_map (*robots, d, c), noise_map (*robots, d, k)."""
+    """tau | E ~ N(mean_map E + offset, noise_map noise_map').
+
+    mean_map (*robots, d, c), offset (*robots, d), noise_map (*robots, d, k).
+    """
 
     @property
     def mean_map(self) -> np.ndarray: ...
+
+    @property
+    def offset(self) -> np.ndarray: ...
 
     @property
     def noise_map(self) -> np.ndarray: ...
@@ -30,7 +36,7 @@ class Law(Protocol):
 class ExactDenoiser:
     """The posterior mean in scaled coordinates z = D^-1 (tau - mean).
 
-    With mu = D^-1 (mean_map E - mean), D^-1 noise_map noise_map' D^-1 = U diag(variance) U' and a = alpha_bar_i,
+    With mu = D^-1 (mean_map E + offset - mean), D^-1 noise_map noise_map' D^-1 = U diag(variance) U', a = alpha_bar_i,
 
         tau0_hat = mu + U diag( sqrt(a) variance / (a variance + 1 - a) ) U' (tau_i - sqrt(a) mu).
 
@@ -49,7 +55,7 @@ class ExactDenoiser:
         self.variance = np.where(s > rounding, s, 0) ** 2
         self.basis = torch.tensor(U, device=device)
         self._mean_map = torch.tensor(law.mean_map / scale, device=device)
-        self._offset = torch.tensor(coordinates.mean / coordinates.scale, device=device)
+        self._offset = torch.tensor((coordinates.mean - law.offset) / coordinates.scale, device=device)
 
     def mean(self, environment: Tensor) -> Tensor:
         """mu (*robots, ..., d), the scaled mean given E (*robots, ..., c)."""
@@ -58,16 +64,15 @@ class ExactDenoiser:
                 f"denoiser: the environment has {environment.shape[-1]} entries; the law was made for "
                 f"{self._mean_map.shape[-1]}"
             )
-        return _along(self._mean_map, environment) - self._offset
+        mean = _along(self._mean_map, environment)
+        return mean - _beside(self._offset, mean)
 
     @torch.inference_mode()
     def __call__(self, tau: Tensor, i: int, environment: Tensor) -> Tensor:
         """tau0_hat (*robots, ..., d) from tau of the same shape, i in 1..L and E (*robots, ..., c)."""
         mu, a = self.mean(environment), float(self.alpha_bar[i])
         deviation = _along(self.basis.mT, tau - a**0.5 * mu)
-        gain = self._gain(a)
-        gain = gain.reshape(*gain.shape[:-1], *(1,) * (tau.ndim - gain.ndim), gain.shape[-1])
-        return mu + _along(self.basis, gain * deviation)
+        return mu + _along(self.basis, _beside(self._gain(a), tau) * deviation)
 
     def _gain(self, a: float) -> Tensor:
         """sqrt(a) variance / (a variance + 1 - a), and 0 where variance is 0, (*robots, r)."""
@@ -78,3 +83,8 @@ class ExactDenoiser:
 def _along(M: Tensor, vectors: Tensor) -> Tensor:
     """`trajectory.response.along`, which needs no more than numpy and torch have in common."""
     return cast(Tensor, along(cast(np.ndarray, M), cast(np.ndarray, vectors)))
+
+
+def _beside(c: Tensor, vectors: Tensor) -> Tensor:
+    """`trajectory.response.beside`, likewise."""
+    return cast(Tensor, beside(cast(np.ndarray, c), cast(np.ndarray, vectors)))

@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from dadiff.systems import LinearSystem
+from dadiff.systems import System
 from dadiff.tasks import Cases, Scores
 from dadiff.trajectory.layout import TrajectoryLayout
-from dadiff.trajectory.response import along
 
 
 def _squared(difference: np.ndarray) -> np.ndarray:
@@ -23,20 +22,20 @@ def _to_horizon(values: np.ndarray) -> np.ndarray:
     return np.concatenate([values, np.full((*values.shape[:-1], 1), np.nan)], axis=-1)
 
 
-def replay(system: LinearSystem, layout: TrajectoryLayout, planned: np.ndarray, x_init: np.ndarray) -> np.ndarray:
+def replay(system: System, layout: TrajectoryLayout, planned: np.ndarray, x_init: np.ndarray) -> np.ndarray:
     """The trajectories (*robots, cases, samples, d) that the planned inputs give from x_init, without noise."""
     inputs = layout.inputs(planned)
     return layout.flatten(system.simulate(x_init[..., None, :], inputs), inputs)
 
 
-def dynamics_residual(system: LinearSystem, layout: TrajectoryLayout, tau: np.ndarray) -> np.ndarray:
-    """|x(t+1) - A x(t) - B u(t)|^2 for t = 0..T-1, (..., T)."""
+def dynamics_residual(system: System, layout: TrajectoryLayout, tau: np.ndarray) -> np.ndarray:
+    """|x(t+1) - f_t(x(t), u(t))|^2 for t = 0..T-1, (..., T)."""
     x, u = layout.split(tau)
-    return _squared(x[..., 1:, :] - along(system.A, x[..., :-1, :]) - along(system.B, u))
+    return _squared(x[..., 1:, :] - system.step(x[..., :-1, :], u, np.arange(layout.horizon)))
 
 
 def tracking_errors(
-    system: LinearSystem, layout: TrajectoryLayout, cases: Cases, planned: np.ndarray, rollout: np.ndarray
+    system: System, layout: TrajectoryLayout, cases: Cases, planned: np.ndarray, rollout: np.ndarray
 ) -> Scores:
     """State and input errors as planned and after replay, the gap between the two, and the dynamics' residual."""
     x, u = layout.split(planned)

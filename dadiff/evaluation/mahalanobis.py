@@ -33,7 +33,7 @@ class MahalanobisDistance:
         """The distance to the law given E (plans, c)."""
         U, s, _ = np.linalg.svd(law.noise_map, full_matrices=False)
         kept = s > rank_tolerance(s, law.noise_map.shape)
-        return cls(environment @ law.mean_map.T, U[:, kept], s[kept])
+        return cls(law.mean(environment), U[:, kept], s[kept])
 
     def __call__(self, tau: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(on the support, off the support) of tau (plans, d), each (plans,)."""

@@ -1,10 +1,12 @@
 """The LQR expert: finite-horizon affine feedback towards a target that need not be an equilibrium.
 
-    min  sum_{t=0}^{T-1} |x(t) - x_target|_Q^2 + |u(t)|_R^2      s.t. x(t+1) = A x(t) + B u(t)
+    min  sum_{t=0}^{T-1} |x(t) - x_target|_Q^2 + |u(t)|_R^2  +  |x(T) - x_target|_{Q_T}^2
+    s.t. x(t+1) = A_t x(t) + B_t u(t) + c_t
 
-There is no cost on x(T), so u(T-1) = 0. The optimum is u(t) = K(t) x(t) + L(t) x_target (Section IV-A).
+The paper has no cost on x(T) (Q_T = 0), so that u(T-1) = 0. The optimum is u(t) = K(t) x(t) + L(t) x_target + k(t)
+(Section IV-A, where c = 0 and so k = 0).
 Under process noise the closed loop's trajectories are Gaussian given (x_init, x_target); their law is exact.
-Systems may carry leading robot dimensions; everything is vectorised over them.
+Systems may have a robot dimension; everything is vectorised over it.
 """
 
 from __future__ import annotations
@@ -13,41 +15,54 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from dadiff.errors import InfeasibleError
-from dadiff.systems import LinearSystem
+from dadiff.errors import ConfigError, InfeasibleError
+from dadiff.systems import AffineSystem, Linear
+from dadiff.trajectory.response import along, beside
 
 
 @dataclass(frozen=True)
 class AffineFeedback:
-    """u(t) = K(t) x(t) + L(t) x_target.
+    """u(t) = K(t) x(t) + L(t) x_target + k(t).
 
     Args:
         K: (*robots, T, m, n).
         L: (*robots, T, m, n).
+        k: (*robots, T, m).
     """
 
     K: np.ndarray = field(repr=False)
     L: np.ndarray = field(repr=False)
+    k: np.ndarray = field(repr=False)
 
     @property
     def horizon(self) -> int:
         """T."""
         return self.K.shape[-3]
 
+    def at(self, t: int, x: np.ndarray, target: np.ndarray) -> np.ndarray:
+        """u(t) of shape (*robots, ..., m) from x (*robots, ..., n) and x_target of the same shape."""
+        return along(self.K[..., t, :, :], x) + along(self.L[..., t, :, :], target) + beside(self.k[..., t, :], x)
+
 
 @dataclass(frozen=True)
 class GaussianLaw:
-    """tau | E ~ N(mean_map E, noise_map noise_map'), the closed loop's law (Theorem 1).
+    """tau | E ~ N(mean_map E + offset, noise_map noise_map'), the closed loop's law (Theorem 1).
 
     The covariance is singular: x(0) is given and u(0) is deterministic.
 
     Args:
         mean_map: (*robots, d, 2n), acting on E = [x_init; x_target].
+        offset: (*robots, d), 0 where the system has none.
         noise_map: (*robots, d, nT), from unit noise to the trajectory.
     """
 
     mean_map: np.ndarray = field(repr=False)
+    offset: np.ndarray = field(repr=False)
     noise_map: np.ndarray = field(repr=False)
+
+    def mean(self, ends: np.ndarray) -> np.ndarray:
+        """The mean (*robots, ..., d) given [x_init; x_target] (*robots, ..., 2n)."""
+        return along(self.mean_map, ends) + beside(self.offset, ends)
 
     @property
     def covariance(self) -> np.ndarray:
@@ -55,32 +70,38 @@ class GaussianLaw:
         return self.noise_map @ self.noise_map.swapaxes(-1, -2)
 
 
-def optimal_feedback(system: LinearSystem, Q: np.ndarray, R: np.ndarray, horizon: int) -> AffineFeedback:
+def optimal_feedback(
+    system: AffineSystem, Q: np.ndarray, R: np.ndarray, horizon: int, terminal: np.ndarray | None = None
+) -> AffineFeedback:
     """The finite-horizon optimum by dynamic programming.
 
-    With the value function x' P x - 2 x' S x_target + const and P(T) = S(T) = 0, going backwards,
+    With the value function x' P x - 2 x' S x_target + 2 x' s + const and P(T) = S(T) = Q_T, s(T) = 0, going backwards,
 
-        K = -(R + B'PB)^-1 B'PA,    L = (R + B'PB)^-1 B'S,    P <- Q + A'P(A + BK),    S <- Q + (A + BK)'S.
+        K = -(R + B'PB)^-1 B'PA,    L = (R + B'PB)^-1 B'S,    k = -(R + B'PB)^-1 B'(Pc + s),
+        P <- Q + A'P(A + BK),       S <- Q + (A + BK)'S,      s <- (A + BK)'(Pc + s).
 
     Args:
         Q: (n, n), R: (m, m), positive semidefinite and positive definite.
+        terminal: Q_T (n, n), None for 0.
 
     Raises:
         InfeasibleError: if the recursion leaves float range (an unstable system over a long horizon).
     """
-    A, B, (n, m) = system.A, system.B, system.B.shape[-2:]
-    At, Bt = A.swapaxes(-1, -2), B.swapaxes(-1, -2)
+    (A, B, c), n, m = system.matrices(horizon), system.state_dim, system.input_dim
     K, L = np.empty((2, *system.robots, horizon, m, n))
-    P = S = np.zeros_like(A)
+    k, s = np.empty((*system.robots, horizon, m)), np.zeros((*system.robots, n, 1))
+    P = S = np.broadcast_to(np.zeros((n, n)) if terminal is None else terminal, (*system.robots, n, n))
     with np.errstate(over="ignore", invalid="ignore"):
         for t in reversed(range(horizon)):
-            gain = np.linalg.solve(R + Bt @ P @ B, Bt)
-            K[..., t, :, :], L[..., t, :, :] = -gain @ P @ A, gain @ S
-            closed = A + B @ K[..., t, :, :]
-            P, S = Q + At @ P @ closed, Q + closed.swapaxes(-1, -2) @ S
-            P = (P + P.swapaxes(-1, -2)) / 2
-    _check_finite(P, S, horizon)
-    return AffineFeedback(K, L)
+            A_t, B_t, Bt = A[..., t, :, :], B[..., t, :, :], B[..., t, :, :].swapaxes(-1, -2)
+            gain = np.linalg.solve(R + Bt @ P @ B_t, Bt)
+            pull = P @ c[..., t, :, None] + s
+            K[..., t, :, :], L[..., t, :, :], k[..., t, :] = -gain @ P @ A_t, gain @ S, -(gain @ pull)[..., 0]
+            closed = A_t + B_t @ K[..., t, :, :]
+            P, S = Q + A_t.swapaxes(-1, -2) @ P @ closed, Q + closed.swapaxes(-1, -2) @ S
+            P, s = (P + P.swapaxes(-1, -2)) / 2, closed.swapaxes(-1, -2) @ pull
+    _check_finite(P, S + s, horizon)
+    return AffineFeedback(K, L, k)
 
 
 def _check_finite(P: np.ndarray, S: np.ndarray, horizon: int) -> None:
@@ -93,22 +114,31 @@ def _check_finite(P: np.ndarray, S: np.ndarray, horizon: int) -> None:
         )
 
 
-def stationary_feedback(system: LinearSystem, Q: np.ndarray, R: np.ndarray, horizon: int) -> AffineFeedback:
-    """u(t) = K (x(t) - x_target) with the infinite-horizon gain of python-control's dlqr."""
+def stationary_feedback(system: AffineSystem, Q: np.ndarray, R: np.ndarray, horizon: int) -> AffineFeedback:
+    """u(t) = K (x(t) - x_target) with the infinite-horizon gain of python-control's dlqr.
+
+    Raises:
+        ConfigError: if the system varies in time or has an offset, of which such a gain knows nothing.
+    """
     import control
 
+    if not isinstance(system, Linear) or system.c.any():
+        raise ConfigError(
+            "task: expert=stationary is for systems that do not vary in time and have no offset c; use expert=optimal"
+        )
     A, B = system.A.reshape(-1, *system.A.shape[-2:]), system.B.reshape(-1, *system.B.shape[-2:])
     K = -np.stack([control.dlqr(a, b, Q, R)[0] for a, b in zip(A, B, strict=True)])
     K = np.repeat(K.reshape(*system.robots, 1, *K.shape[-2:]), horizon, axis=-3)
-    return AffineFeedback(K, -K)
+    return AffineFeedback(K, -K, np.zeros(K.shape[:-1]))
 
 
-def closed_loop_law(system: LinearSystem, feedback: AffineFeedback) -> GaussianLaw:
+def closed_loop_law(system: AffineSystem, feedback: AffineFeedback) -> GaussianLaw:
     """The law of trajectories under the feedback and process noise.
 
     Propagates the linear maps from [x_init; x_target; w(0:T-1)] to x(t) and u(t).
     """
-    T, (n, m) = feedback.horizon, system.B.shape[-2:]
+    T, n, m = feedback.horizon, system.state_dim, system.input_dim
+    A, B, _ = system.matrices(T)
     num_sources = 2 * n + n * T
     states = np.zeros((*system.robots, T + 1, n, num_sources))
     inputs = np.zeros((*system.robots, T, m, num_sources))
@@ -118,9 +148,31 @@ def closed_loop_law(system: LinearSystem, feedback: AffineFeedback) -> GaussianL
     for t in range(T):
         x = states[..., t, :, :]
         u = inputs[..., t, :, :] = feedback.K[..., t, :, :] @ x + feedback.L[..., t, :, :] @ target
-        states[..., t + 1, :, :] = system.A @ x + system.B @ u
+        states[..., t + 1, :, :] = A[..., t, :, :] @ x + B[..., t, :, :] @ u
         noise = 2 * n + n * t
         states[..., t + 1, :, noise : noise + n] += np.diag(np.broadcast_to(system.process_noise, n))
     by_source = system.layout(T).flatten(np.moveaxis(states, -1, -3), np.moveaxis(inputs, -1, -3))
     maps = by_source.swapaxes(-1, -2)
-    return GaussianLaw(maps[..., : 2 * n], maps[..., 2 * n :])
+    rest = np.zeros((*system.robots, n))
+    return GaussianLaw(maps[..., : 2 * n], follow(system, feedback, rest, rest), maps[..., 2 * n :])
+
+
+def follow(
+    system: AffineSystem,
+    feedback: AffineFeedback,
+    x_init: np.ndarray,
+    target: np.ndarray,
+    noise: np.ndarray | None = None,
+) -> np.ndarray:
+    """The closed loop's trajectories (*robots, ..., d) from x_init and towards target, both (*robots, ..., n).
+
+    Args:
+        noise: w of shape (*robots, ..., T, n), or None for none.
+    """
+    x, states, inputs = x_init, [x_init], []
+    for t in range(feedback.horizon):
+        inputs.append(feedback.at(t, x, target))
+        x = system.step(x, inputs[-1], t)
+        x = x if noise is None else x + noise[..., t, :]
+        states.append(x)
+    return system.layout(feedback.horizon).flatten(np.stack(states, axis=-2), np.stack(inputs, axis=-2))

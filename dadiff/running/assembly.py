@@ -15,7 +15,7 @@ from dadiff.experts.lqr import GaussianLaw
 from dadiff.running.identity import Artefact, Identity, identity_of
 from dadiff.running.parts import Parts
 from dadiff.store import Cache, Results
-from dadiff.systems import LinearSystem
+from dadiff.systems import System
 from dadiff.tasks import Cases, Demonstrations
 from dadiff.tasks.task import Augmenting, Lawful
 from dadiff.trajectory.coordinates import Coordinates, physical, standardised
@@ -56,10 +56,10 @@ class Experiment:
         return self.parts.settings.output_dir
 
     @cached_property
-    def target(self) -> LinearSystem:
+    def target(self) -> System:
         """The system, or the robots, that plans are made for."""
         target = self.parts.task.target(self.parts.system)
-        if not isinstance(target, LinearSystem):
+        if not isinstance(target, System):
             raise ConfigError(
                 "task: it plans for one system, and the chosen system is a family of robots; "
                 "use task=fleet, or a single system such as system=double_integrator"

@@ -25,7 +25,7 @@ from dadiff.randomness import numpy_generator, torch_generator
 from dadiff.running.assembly import Experiment
 from dadiff.running.provenance import record_of
 from dadiff.store import StoredRun
-from dadiff.systems import LinearSystem, Robots
+from dadiff.systems import Robots, System
 from dadiff.tasks import Scores
 
 EXAMPLE_ROBOTS = 3
@@ -224,7 +224,7 @@ def examples(experiment: Experiment, plans: Plans) -> dict[str, np.ndarray]:
     }
 
 
-def _shown(target: LinearSystem) -> tuple[LinearSystem, Any]:
+def _shown(target: System) -> tuple[System, Any]:
     """The robots whose plans are stored, as a system and as an index; everything where there is one system."""
     if not isinstance(target, Robots):
         return target, Ellipsis

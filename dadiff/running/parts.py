@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from dadiff.diffusion.samplers import Sampler
     from dadiff.diffusion.schedule import Schedule
     from dadiff.evaluation import Evaluation
-    from dadiff.systems import Family, LinearSystem
+    from dadiff.systems import Family, System
     from dadiff.systems.recording import Recorder
     from dadiff.tasks import Task
     from dadiff.tracking import Tracking
@@ -34,7 +34,7 @@ class Parts:
 
     settings: Settings
     nodes: Mapping[str, Mapping[str, Any]]
-    system: LinearSystem | Family
+    system: System | Family
     task: Task
     dataset: Dataset
     recording: Recorder

@@ -2,17 +2,23 @@
 
 from dadiff.systems.families import DampedIntegrators, Family, LaggedIntegrators, Robots, RotatedIntegrators
 from dadiff.systems.integrators import double_integrator
-from dadiff.systems.linear import LinearSystem
+from dadiff.systems.linear import AffineSystem, Linear, TimeVarying, require_affine
 from dadiff.systems.recording import GaussianExcitation, Recording
+from dadiff.systems.system import Bounds, System
 
 __all__ = [
+    "AffineSystem",
+    "Bounds",
     "DampedIntegrators",
     "Family",
     "GaussianExcitation",
     "LaggedIntegrators",
-    "LinearSystem",
+    "Linear",
     "Recording",
     "Robots",
     "RotatedIntegrators",
+    "System",
+    "TimeVarying",
     "double_integrator",
+    "require_affine",
 ]

@@ -8,16 +8,16 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from dadiff.errors import ConfigError
-from dadiff.systems.linear import LinearSystem
+from dadiff.systems.linear import Linear
 
 
-@dataclass(frozen=True)
-class Robots(LinearSystem):
+@dataclass(frozen=True, kw_only=True)
+class Robots(Linear):
     """A fleet, and the parameters that tell its robots apart.
 
     Args:
@@ -36,7 +36,8 @@ class Robots(LinearSystem):
     def take(self, index: Sequence[int] | np.ndarray) -> Robots:
         """The robots at `index`."""
         parameters = {name: values[index] for name, values in self.parameters.items()}
-        return Robots(self.A[index], self.B[index], self.process_noise, parameters, self.distance[index])
+        arrays = {name: getattr(self, name)[index] for name in ("A", "B", "c", "distance")}
+        return replace(self, **arrays, robots=arrays["distance"].shape, parameters=parameters)
 
     def most_different(self, count: int) -> np.ndarray:
         """Indices of at most `count` robots: the one farthest out, then each as far as possible from those before."""
@@ -116,11 +117,11 @@ class Family(ABC):
     """A dataclass of ranges and constants, with a yaml in `conf/system/`."""
 
     time_step: float
-    process_noise: float
+    process_noise: float | Sequence[float]
 
     def check(self) -> None:
         """Raise `ConfigError` on an empty range (in `Ranges`), a time step or a noise that makes no sense."""
-        if not self.ranges.bounds or not self.time_step > 0 or not self.process_noise >= 0:
+        if not self.ranges.bounds or not self.time_step > 0 or not (np.asarray(self.process_noise) >= 0).all():
             raise ConfigError(
                 f"system: time_step is {self.time_step} and process_noise {self.process_noise}; "
                 "need a positive number of seconds and a standard deviation of at least 0"
@@ -138,7 +139,16 @@ class Family(ABC):
     def robots(self, values: np.ndarray) -> Robots:
         """The robots with parameters (robots, p)."""
         columns = dict(zip(self.ranges.bounds, np.moveaxis(values, -1, 0), strict=True))
-        return Robots(*self.dynamics(*columns.values()), self.process_noise, columns, self.ranges.distance(values))
+        A, B = self.dynamics(*columns.values())
+        return Robots(
+            A,
+            B,
+            robots=A.shape[:1],
+            process_noise=self.process_noise,
+            time_step=self.time_step,
+            parameters=columns,
+            distance=self.ranges.distance(values),
+        )
 
     def inside(self, count: int, rng: np.random.Generator) -> Robots:
         """`count` robots drawn uniformly from the ranges."""
@@ -165,13 +175,13 @@ class DampedIntegrators(Family):
         damping: range of c, 1/s.
         gain: range of b.
         time_step: h, in seconds.
-        process_noise: standard deviation of w(t) per state and step.
+        process_noise: standard deviation of w(t) per step, a number or one for each state.
     """
 
     damping: Sequence[float] = (0.0, 3.0)
     gain: Sequence[float] = (0.4, 2.0)
     time_step: float = 0.1
-    process_noise: float = 0.01
+    process_noise: float | Sequence[float] = 0.01
 
     def __post_init__(self) -> None:
         self.check()
@@ -199,14 +209,14 @@ class RotatedIntegrators(Family):
         gain: range of b.
         angle: range of a, radians.
         time_step: h, in seconds.
-        process_noise: standard deviation of w(t) per state and step.
+        process_noise: standard deviation of w(t) per step, a number or one for each state.
     """
 
     damping: Sequence[float] = (0.0, 3.0)
     gain: Sequence[float] = (0.4, 2.0)
     angle: Sequence[float] = (-1.0, 1.0)
     time_step: float = 0.1
-    process_noise: float = 0.01
+    process_noise: float | Sequence[float] = 0.01
 
     def __post_init__(self) -> None:
         self.check()
@@ -235,14 +245,14 @@ class LaggedIntegrators(Family):
         gain: range of b.
         lag: range of l, in seconds, positive.
         time_step: h, in seconds.
-        process_noise: standard deviation of w(t) per state and step.
+        process_noise: standard deviation of w(t) per step, a number or one for each state.
     """
 
     damping: Sequence[float] = (0.0, 3.0)
     gain: Sequence[float] = (0.4, 2.0)
     lag: Sequence[float] = (0.05, 0.4)
     time_step: float = 0.1
-    process_noise: float = 0.01
+    process_noise: float | Sequence[float] = 0.01
 
     def __post_init__(self) -> None:
         self.check()

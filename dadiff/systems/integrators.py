@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
 
 from dadiff.errors import ConfigError
-from dadiff.systems.linear import LinearSystem
+from dadiff.systems.linear import Linear
 
 
 def discretise(
@@ -31,8 +32,8 @@ def double_integrator(
     axes: int = 2,
     time_step: float = 0.1,
     discretisation: Literal["euler", "zoh"] = "euler",
-    process_noise: float = 0.01,
-) -> LinearSystem:
+    process_noise: float | Sequence[float] = 0.01,
+) -> Linear:
     """Positions and velocities driven by accelerations: n = 2 axes, m = axes.
 
     With two axes, forward Euler and a time step of 0.1 s these are the A, B of the paper's Section IV-A.
@@ -40,10 +41,10 @@ def double_integrator(
     Args:
         axes: number of spatial axes.
         time_step: in seconds.
-        process_noise: standard deviation of w(t) per state and step.
+        process_noise: standard deviation of w(t) per step, a number or one for each state.
     """
     if axes < 1:
         raise ConfigError(f"system: axes is {axes}; it must be at least 1")
     zero, one = np.zeros((axes, axes)), np.eye(axes)
     A, B = np.block([[zero, one], [zero, zero]]), np.vstack([zero, one])
-    return LinearSystem(*discretise(A, B, time_step, discretisation), process_noise)
+    return Linear(*discretise(A, B, time_step, discretisation), process_noise=process_noise, time_step=time_step)

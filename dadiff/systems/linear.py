@@ -1,46 +1,59 @@
-"""Linear time-invariant systems x(t+1) = A x(t) + B u(t) + w(t), eq. (1) of the paper."""
+"""Linear systems x(t+1) = A x(t) + B u(t) + c + w(t), eq. (1) of the paper with an offset, and those that vary in time.
+
+A fleet of 30 and a system that varies over 30 steps have arrays of the same shape. They are told apart by type and by
+`robots`, never by shape: `Linear(A (R, n, n), ..., robots=R)` is the one, `TimeVarying(A (T, n, n), ...)` the other.
+"""
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from dadiff.errors import ConfigError, ShapeError
-from dadiff.trajectory.layout import TrajectoryLayout
-from dadiff.trajectory.response import layout_of, simulate, trajectory_map
+from dadiff.systems.system import System, Times
+from dadiff.trajectory.response import along, beside, simulate, trajectory_map
 
 
 @dataclass(frozen=True)
-class LinearSystem:
-    """One system, or a fleet of them along leading dimensions.
+class AffineSystem(System):
+    """Whose step is x -> A_t x + B_t u + c_t.
 
     Args:
-        A: (*robots, n, n).
-        B: (*robots, n, m).
-        process_noise: standard deviation of w(t) per state and step, in the units of the state; a number, or (n,).
+        A, B, c: see the subclasses; c=None is 0.
+        robots: R where arrays have a first dimension of R robots, kept as (R,); () for a single system.
 
     Raises:
-        ShapeError: if A is not square, B has another number of rows, or their leading dimensions differ.
-        ConfigError: if an entry is not finite or the noise is negative.
+        ShapeError: if A is not square, B or c do not fit it, or their leading dimensions are not those of the type.
+        ConfigError: if an entry is not finite.
     """
 
     A: np.ndarray = field(repr=False)
     B: np.ndarray = field(repr=False)
-    process_noise: float | np.ndarray = 0.0
+    c: np.ndarray = field(default=None, repr=False)  # type: ignore[arg-type]
+    robots: tuple[int, ...] = field(default=(), kw_only=True)
 
     def __post_init__(self) -> None:
         A, B = _stacked(self.A, "A"), _stacked(self.B, "B")
-        object.__setattr__(self, "A", A)
-        object.__setattr__(self, "B", B)
-        if A.ndim < 2 or A.shape[-1] != A.shape[-2] or B.ndim < 2 or B.shape[:-1] != A.shape[:-1]:
-            raise ShapeError(f"system: A has shape {A.shape} and B {B.shape}; expected (..., n, n) and (..., n, m)")
-        if not (np.isfinite(A).all() and np.isfinite(B).all()):
-            raise ConfigError("system: A or B holds a value that is not finite")
-        if not ((noise := np.asarray(self.process_noise)) >= 0).all() or np.isinf(noise).any():
-            raise ConfigError(
-                f"system: process_noise is {self.process_noise}; a standard deviation is finite and not negative"
+        c = np.zeros(A.shape[:-1]) if self.c is None else _stacked(self.c, "c")
+        robots = () if self.robots is None else tuple(np.atleast_1d(np.asarray(self.robots, dtype=int)).tolist())
+        for name, value in (("A", A), ("B", B), ("c", c), ("robots", robots)):
+            object.__setattr__(self, name, value)
+        self._check_dimensions()
+        if A.shape[-1:] != A.shape[-2:-1] or B.shape[:-1] != A.shape[:-1] or c.shape != A.shape[:-1]:
+            lead = "".join(f"{size}, " for size in A.shape[:-2])
+            raise ShapeError(
+                f"system: A has shape {A.shape}, B {B.shape} and c {c.shape}; "
+                f"expected ({lead}n, n), ({lead}n, m) and ({lead}n)"
             )
+        if not all(np.isfinite(M).all() for M in (A, B, c)):
+            raise ConfigError("system: A, B or c holds a value that is not finite")
+        self.check()
+
+    @abstractmethod
+    def _check_dimensions(self) -> None:
+        """Raise unless A has the leading dimensions of this type."""
 
     @property
     def state_dim(self) -> int:
@@ -52,27 +65,158 @@ class LinearSystem:
         """m."""
         return self.B.shape[-1]
 
-    @property
-    def robots(self) -> tuple[int, ...]:
-        """Leading dimensions: () for a single system."""
-        return self.A.shape[:-2]
+    @abstractmethod
+    def at(self, t: Times) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """A (*robots, *t.shape, n, n), B and c at times t, or without the dimensions of t where nothing varies."""
 
-    def layout(self, horizon: int) -> TrajectoryLayout:
-        """The layout of this system's trajectories over T inputs."""
-        return layout_of(self.A, self.B, horizon)
+    @abstractmethod
+    def matrices(self, horizon: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """A (*robots, T, n, n), B (*robots, T, n, m) and c (*robots, T, n) for t = 0..T-1."""
 
     def trajectory_map(self, horizon: int) -> np.ndarray:
         """F of shape (*robots, d, n + mT), eq. (4)."""
-        return trajectory_map(self.A, self.B, horizon)
+        A, B, _ = self.matrices(horizon)
+        return trajectory_map(A, B)
+
+    def offset(self, horizon: int) -> np.ndarray:
+        """The trajectory from rest without inputs, (*robots, d): tau = F [x(0); u(0:T-1)] + offset."""
+        x_init, inputs = (np.zeros((*self.robots, *s)) for s in ((self.state_dim,), (horizon, self.input_dim)))
+        return self.layout(horizon).flatten(self.simulate(x_init, inputs), inputs)
+
+
+@dataclass(frozen=True)
+class Linear(AffineSystem):
+    """Time-invariant: one system, or a fleet of them.
+
+    Args:
+        A: (n, n), or (R, n, n) with robots=R.
+        B: (n, m), or (R, n, m).
+        c: (n,), or (R, n); None for 0.
+
+    Example:
+        >>> Linear([[1.0, 0.1], [0.0, 1.0]], [[0.0], [0.1]], time_step=0.1).state_dim
+        2
+    """
+
+    def _check_dimensions(self) -> None:
+        if self.A.shape[:-2] != self.robots or len(self.robots) > 1 or self.A.ndim < 2:
+            count = self.A.shape[0] if self.A.ndim else 0
+            raise ShapeError(
+                f"system: A has shape {self.A.shape}; a Linear system has (n, n), with robots=R (R, n, n), here robots "
+                f"is {self.robots[0] if self.robots else None}; for {count} robots give robots={count}, "
+                f"for matrices that vary over T = {count} steps use TimeVarying"
+            )
+
+    def at(self, t: Times) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """A, B and c, whatever the time."""
+        return self.A, self.B, self.c
+
+    def matrices(self, horizon: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The same for every step, without copies."""
+        parts = ((self.A, 2), (self.B, 2), (self.c, 1))
+        A, B, c = (np.broadcast_to(np.expand_dims(M, -1 - k), (*self.robots, horizon, *M.shape[-k:])) for M, k in parts)
+        return A, B, c
+
+    def step(self, x: np.ndarray, u: np.ndarray, t: Times = 0) -> np.ndarray:
+        """A x + B u + c."""
+        return along(self.A, x) + along(self.B, u) + beside(self.c, x)
+
+    def linearise(self, x: np.ndarray, u: np.ndarray, t: Times = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(A, B, c) at every point, without copies."""
+        lead, ones = x.shape[:-1], (1,) * (x.ndim - 1 - len(self.robots))
+        A, B, c = (
+            np.broadcast_to(M.reshape(*self.robots, *ones, *M.shape[-k:]), (*lead, *M.shape[-k:]))
+            for M, k in ((self.A, 2), (self.B, 2), (self.c, 1))
+        )
+        return A, B, c
 
     def simulate(self, x_init: np.ndarray, inputs: np.ndarray, noise: np.ndarray | None = None) -> np.ndarray:
-        """States (*robots, ..., T+1, n) of a roll-out; without noise unless it is given."""
+        """As `System.simulate`; what inputs and offset add is found for all steps at once."""
+        if self.c.any():
+            noise = beside(self.c, inputs) + (0.0 if noise is None else noise)
         return simulate(self.A, self.B, x_init, inputs, noise)
 
 
+@dataclass(frozen=True)
+class TimeVarying(AffineSystem):
+    """A_t, B_t and c_t for t = 0..T-1: one system, or a fleet of them.
+
+    Args:
+        A: (T, n, n), or (R, T, n, n) with robots=R.
+        B: (T, n, m), or (R, T, n, m).
+        c: (T, n), or (R, T, n); None for 0.
+    """
+
+    @property
+    def horizon(self) -> int:
+        """T, for how many steps the matrices are given."""
+        return self.A.shape[-3]
+
+    def _check_dimensions(self) -> None:
+        if self.A.shape[:-3] != self.robots or len(self.robots) > 1 or self.A.ndim < 3:
+            raise ShapeError(
+                f"system: A has shape {self.A.shape}; a TimeVarying system has (T, n, n), with robots=R (R, T, n, n), "
+                f"here robots is {self.robots[0] if self.robots else None}; for a fleet whose matrices do not vary use "
+                "Linear with robots=R"
+            )
+
+    def at(self, t: Times) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """A, B and c at times t.
+
+        Raises:
+            ShapeError: for a time at which no matrices are given.
+        """
+        times, robots = np.asarray(t), (slice(None),) * len(self.robots)
+        if times.size and not (times.min() >= 0 and times.max() < self.horizon):
+            raise ShapeError(
+                f"system: it is given for steps 0..{self.horizon - 1}, asked for step {int(times.max())}; "
+                "give matrices for more steps or choose a shorter horizon"
+            )
+        index: tuple[slice | np.ndarray, ...] = (*robots, times)
+        return self.A[index], self.B[index], self.c[index]
+
+    def matrices(self, horizon: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Those of the first T steps."""
+        return self.at(np.arange(horizon))
+
+    def step(self, x: np.ndarray, u: np.ndarray, t: Times = 0) -> np.ndarray:
+        """A_t x + B_t u + c_t."""
+        A, B, c = self.at(t)
+        if np.ndim(t) == 0:
+            return along(A, x) + along(B, u) + beside(c, x)
+        A, B, c = self.linearise(x, u, t)
+        return (A @ x[..., None] + B @ u[..., None])[..., 0] + c
+
+    def linearise(self, x: np.ndarray, u: np.ndarray, t: Times = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(A_t, B_t, c_t) at every point, without copies but of the times."""
+        lead, R, times = x.shape[:-1], len(self.robots), np.shape(t)
+        ones = (1,) * (len(lead) - R - len(times))
+        A, B, c = (
+            np.broadcast_to(M.reshape(*self.robots, *ones, *times, *M.shape[-k:]), (*lead, *M.shape[-k:]))
+            for M, k in zip(self.at(t), (2, 2, 1), strict=True)
+        )
+        return A, B, c
+
+
+def require_affine(system: object, what: str) -> AffineSystem:
+    """The system, if it is linear with an offset.
+
+    Args:
+        what: asks for it, for the message.
+
+    Raises:
+        ConfigError: if it is any other.
+    """
+    if not isinstance(system, AffineSystem):
+        raise ConfigError(
+            f"{what} needs a linear system, found {type(system).__name__}; use one that is Linear or TimeVarying"
+        )
+    return system
+
+
 def _stacked(matrices: object, name: str) -> np.ndarray:
-    """One array from a matrix, an array of them, or a list of one a robot."""
+    """One array from a matrix, an array of them, or a list of rows, or of one matrix a robot or a step."""
     shapes = {np.shape(M) for M in matrices} if isinstance(matrices, list | tuple) else set()
     if len(shapes) > 1:
-        raise ShapeError(f"system: the robots' {name} have shapes {sorted(shapes)}; all robots must share n and m")
+        raise ShapeError(f"system: parts of {name} have shapes {sorted(shapes)}; rows, robots and steps must be alike")
     return np.asarray(matrices, dtype=np.float64)

@@ -9,7 +9,7 @@ import numpy as np
 
 from dadiff.errors import ConfigError, ShapeError
 from dadiff.randomness import numpy_generator
-from dadiff.systems.linear import LinearSystem
+from dadiff.systems.system import System
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Recording:
 class Recorder(Protocol):
     """Where recordings come from."""
 
-    def record(self, system: LinearSystem) -> Recording:
+    def record(self, system: System) -> Recording:
         """Γ of the system, or of each of its robots."""
         ...
 
@@ -73,7 +73,7 @@ class GaussianExcitation:
             if (std := getattr(self, name)) is not None and not 0 <= std < np.inf:
                 raise ConfigError(f"recording: {name} is {std}; a standard deviation is finite and not negative")
 
-    def record(self, system: LinearSystem) -> Recording:
+    def record(self, system: System) -> Recording:
         """Γ of every robot of the system."""
         rng = numpy_generator(self.seed, "recording")
         shape = (*system.robots, self.count, self.length)

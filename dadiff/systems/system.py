@@ -9,6 +9,7 @@ dimension comes first: arrays are (*robots, ..., n) with `robots` = () or (R,). 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -79,7 +80,7 @@ class System(ABC):
         state_names, input_names, state_units, input_units: for figures and tables; one for each, or none.
     """
 
-    process_noise: float | np.ndarray = 0.0
+    process_noise: float | Sequence[float] | np.ndarray = 0.0
     time_step: float | None = None
     bounds: Bounds = field(default_factory=Bounds)
     state_names: tuple[str, ...] = ()
@@ -158,13 +159,14 @@ class System(ABC):
         return np.asarray(self.process_noise) * rng.standard_normal((*shape, self.state_dim))
 
     def check(self) -> None:
-        """Raise unless noise, time step, bounds, names and units fit n and m; call it in `__post_init__`.
+        """Raise unless noise, time step, bounds, names and units fit n and m; to be called in `__post_init__`.
 
         Raises:
             ConfigError: if the noise is negative or not finite, or the time step is not positive.
             ShapeError: if there is not one entry for each state or input.
         """
-        noise = np.asarray(self.process_noise)
+        noise = np.asarray(self.process_noise, dtype=np.float64)
+        object.__setattr__(self, "process_noise", noise if noise.ndim else float(noise))
         if not (noise >= 0).all() or np.isinf(noise).any():
             raise ConfigError(
                 f"system: process_noise is {self.process_noise}; a standard deviation is finite and not negative"

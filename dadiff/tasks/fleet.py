@@ -20,7 +20,6 @@ from dadiff.systems import Family, GaussianExcitation, Recording, Robots
 from dadiff.tasks.lqr import LQR, ends_layout
 from dadiff.tasks.task import Cases, Demonstrations, Scores, encoded
 from dadiff.trajectory import Channel, Layout
-from dadiff.trajectory.response import along
 
 SERVED = 1.05
 """A robot counts as served if its mean cost is within this factor of the optimum."""
@@ -112,14 +111,14 @@ class Fleet:
         environment = self.lqr.sample_environments(robots, (*robots.robots, count), rng)
         trajectories = self.lqr.realise(robots, environment, rng)
         condition = self._condition(environment, robots, count, rng)
-        notes = {"robots": float(len(robots.A)), "demonstrations a robot": float(count)}
+        notes = {"robots": float(robots.robots[0]), "demonstrations a robot": float(count)}
         return Demonstrations(_joined(trajectories), _joined(condition), notes)
 
     def cases(self, system: Robots, count: int, rng: np.random.Generator) -> Cases:
         """`count` cases, the same for every robot, each with the robot's own optimum and one recording a robot."""
         environment = self.lqr.sample_environments(system, (count,), rng)
         environment = np.broadcast_to(environment, (*system.robots, *environment.shape))
-        reference = along(self.lqr.law(system).mean_map, environment)
+        reference = self.lqr.law(system).mean(environment)
         condition = self._condition(environment, system, 1, rng)
         return Cases(self.condition(system), condition, reference)
 

@@ -11,13 +11,13 @@ import numpy as np
 
 from dadiff.errors import ConfigError
 from dadiff.experts.lqr import AffineFeedback, GaussianLaw, closed_loop_law, optimal_feedback, stationary_feedback
-from dadiff.systems import LinearSystem
+from dadiff.systems import AffineSystem
 from dadiff.tasks.task import Cases, Demonstrations, Scores, encoded
 from dadiff.trajectory import Channel, Layout
 from dadiff.trajectory.response import along
 
 
-def ends_layout(system: LinearSystem) -> Layout:
+def ends_layout(system: AffineSystem) -> Layout:
     """[x_init; target], each (n,): what the expert needs to know."""
     return Layout((Channel("x_init", system.state_dim), Channel("target", system.state_dim)))
 
@@ -66,23 +66,23 @@ class LQR:
         """(n, n)."""
         return np.diag(np.asarray(self.state_cost, dtype=np.float64))
 
-    def R(self, system: LinearSystem) -> np.ndarray:
+    def R(self, system: AffineSystem) -> np.ndarray:
         """(m, m)."""
         return self.input_cost * np.eye(system.input_dim)
 
-    def target(self, system: LinearSystem) -> LinearSystem:
+    def target(self, system: AffineSystem) -> AffineSystem:
         """The system itself."""
         return system
 
-    def condition(self, system: LinearSystem) -> Layout:
+    def condition(self, system: AffineSystem) -> Layout:
         """E = [x_init; target], each (n,)."""
         return ends_layout(system)
 
-    def environment(self, system: LinearSystem, given: Mapping[str, object]) -> np.ndarray:
+    def environment(self, system: AffineSystem, given: Mapping[str, object]) -> np.ndarray:
         """E (c,) from its fields, each of them checked."""
         return encoded(self.condition(system), given)
 
-    def feedback(self, system: LinearSystem) -> AffineFeedback:
+    def feedback(self, system: AffineSystem) -> AffineFeedback:
         """The expert's controller.
 
         Raises:
@@ -96,46 +96,46 @@ class LQR:
         solve = {"optimal": optimal_feedback, "stationary": stationary_feedback}[self.expert]
         return solve(system, self.Q, self.R(system), self.horizon)
 
-    def law(self, system: LinearSystem) -> GaussianLaw:
+    def law(self, system: AffineSystem) -> GaussianLaw:
         """The Gaussian law of demonstrations given E."""
         return closed_loop_law(system, self.feedback(system))
 
-    def sample_environments(self, system: LinearSystem, shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
+    def sample_environments(self, system: AffineSystem, shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
         """E of shape (*shape, 2n)."""
         ranges = np.repeat([self.init_range, self.target_range], system.state_dim)
         return rng.uniform(-ranges, ranges, size=(*shape, 2 * system.state_dim))
 
-    def demonstrations(self, system: LinearSystem, count: int, rng: np.random.Generator) -> Demonstrations:
+    def demonstrations(self, system: AffineSystem, count: int, rng: np.random.Generator) -> Demonstrations:
         """`count` noisy runs of the expert, each in an environment of its own."""
         environment = self.sample_environments(system, (count,), rng)
         return Demonstrations(self.realise(system, environment, rng), environment)
 
-    def cases(self, system: LinearSystem, count: int, rng: np.random.Generator) -> Cases:
+    def cases(self, system: AffineSystem, count: int, rng: np.random.Generator) -> Cases:
         """`count` cases for each robot of the system."""
         environment = self.sample_environments(system, (*system.robots, count), rng)
         if self.reference == "realised":
             reference = self.realise(system, environment, rng)
         else:
-            reference = along(self.law(system).mean_map, environment)
+            reference = self.law(system).mean(environment)
         return Cases(self.condition(system), environment, reference)
 
-    def realise(self, system: LinearSystem, environment: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    def realise(self, system: AffineSystem, environment: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """One noisy run of the expert for each E (*robots, ..., 2n): tau of shape (*robots, ..., d)."""
         law = self.law(system)
         noise = rng.standard_normal((*environment.shape[:-1], law.noise_map.shape[-1]))
-        return along(law.mean_map, environment) + along(law.noise_map, noise)
+        return law.mean(environment) + along(law.noise_map, noise)
 
-    def cost(self, system: LinearSystem, tau: np.ndarray, target: np.ndarray) -> np.ndarray:
+    def cost(self, system: AffineSystem, tau: np.ndarray, target: np.ndarray) -> np.ndarray:
         """sum_t |x(t) - x_target|_Q^2 + |u(t)|_R^2 of trajectories (..., d) and targets (..., n)."""
         states, inputs = system.layout(self.horizon).split(tau)
         deviation = states[..., :-1, :] - target[..., None, :]
         return (deviation**2 @ np.diag(self.Q)).sum(-1) + self.input_cost * (inputs**2).sum((-2, -1))
 
-    def score(self, system: LinearSystem, cases: Cases, planned: np.ndarray, rollout: np.ndarray) -> Scores:
+    def score(self, system: AffineSystem, cases: Cases, planned: np.ndarray, rollout: np.ndarray) -> Scores:
         """The cost after replay, relative to the noise-free finite-horizon optimum of the case."""
         target = cases.get("target")
         feedback = optimal_feedback(system, self.Q, self.R(system), self.horizon)
         ends = ends_layout(system).pack(x_init=cases.x_init, target=target)
-        optimum = along(closed_loop_law(system, feedback).mean_map, ends)
+        optimum = closed_loop_law(system, feedback).mean(ends)
         ratio = self.cost(system, rollout, target[..., None, :]) / self.cost(system, optimum, target)[..., None]
         return Scores(per_plan={"cost_ratio": ratio})

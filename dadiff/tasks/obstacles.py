@@ -17,7 +17,7 @@ from dadiff.errors import ConfigError, InfeasibleError, ShapeError
 from dadiff.experts.obstacles import batched, ipopt, literal, successive
 from dadiff.experts.obstacles.problem import ObstacleProblem, Solutions, time_step_of
 from dadiff.experts.obstacles.quadratic import obstacle_free
-from dadiff.systems import LinearSystem
+from dadiff.systems import System
 from dadiff.tasks import environments as env
 from dadiff.tasks.environments import Environments
 from dadiff.tasks.obstacle_distribution import ANNULUS, ObstacleDistribution
@@ -94,15 +94,15 @@ class Obstacles:
                 f"task: radius_range is {list(self.radius_range)}; expected 0 < smallest <= largest (metres)"
             )
 
-    def target(self, system: LinearSystem) -> LinearSystem:
+    def target(self, system: System) -> System:
         """The system itself."""
         return system
 
-    def condition(self, system: LinearSystem | None = None) -> Layout:
+    def condition(self, system: System | None = None) -> Layout:
         """E: x_init (4), target (2), and slots of waypoints (W, 4) and obstacles (O, 4)."""
         return env.condition(self.max_waypoints, self.max_obstacles)
 
-    def environment(self, system: LinearSystem, given: Mapping[str, object]) -> np.ndarray:
+    def environment(self, system: System, given: Mapping[str, object]) -> np.ndarray:
         """E (c,) from x_init, target, and lists of waypoints {position, time} and obstacles {centre, radius}.
 
         Raises:
@@ -113,12 +113,12 @@ class Obstacles:
         env.check(environments, self.horizon, time_step_of(system), where="condition: ")
         return env.encode(environments, self.horizon)[0]
 
-    def demonstrations(self, system: LinearSystem, count: int, rng: np.random.Generator) -> Demonstrations:
+    def demonstrations(self, system: System, count: int, rng: np.random.Generator) -> Demonstrations:
         """Optima in `count` drawn environments; those that the expert could not solve are left out and counted."""
         cases = self.cases(system, count, rng)
         return Demonstrations(cases.reference, cases.environment, cases.notes)
 
-    def cases(self, system: LinearSystem, count: int, rng: np.random.Generator) -> Cases:
+    def cases(self, system: System, count: int, rng: np.random.Generator) -> Cases:
         """As `demonstrations`, for testing."""
         dt = time_step_of(system)
         environments, notes = self.distribution_for(dt).sample(count, rng)
@@ -129,7 +129,7 @@ class Obstacles:
         keep = np.flatnonzero(found.solved)
         return self._cases(system, environments.take(keep), found.inputs[keep], notes)
 
-    def solve(self, system: LinearSystem, environment: np.ndarray) -> Cases:
+    def solve(self, system: System, environment: np.ndarray) -> Cases:
         """References for given environments (N, c).
 
         Raises:
@@ -181,7 +181,7 @@ class Obstacles:
         radius = np.where(e.present, e.radius + (self.margin if margin is None else margin), 0)
         return ObstacleProblem(e.x_init, goal, weight, e.centre, radius, self.input_cost, time_step)
 
-    def score(self, system: LinearSystem, cases: Cases, planned: np.ndarray, rollout: np.ndarray) -> Scores:
+    def score(self, system: System, cases: Cases, planned: np.ndarray, rollout: np.ndarray) -> Scores:
         """Collisions, waypoints and sides of plans (cases, samples, d), and the cost of replaying them."""
         environments, layout = self.decode(cases.environment), system.layout(self.horizon)
         expert = layout.states(cases.reference)[..., :2]
@@ -223,9 +223,7 @@ class Obstacles:
         problem = self.problem(environments, time_step)
         return problem, _EXPERTS[self.expert](problem, progress=problem.count >= _SHOW_PROGRESS)
 
-    def _cases(
-        self, system: LinearSystem, environments: Environments, inputs: np.ndarray, notes: dict[str, float]
-    ) -> Cases:
+    def _cases(self, system: System, environments: Environments, inputs: np.ndarray, notes: dict[str, float]) -> Cases:
         states = system.simulate(environments.x_init, inputs)
         reference = system.layout(self.horizon).flatten(states, inputs)
         return Cases(self.condition(), env.encode(environments, self.horizon), reference, notes)

@@ -14,7 +14,7 @@ import numpy as np
 
 from dadiff.errors import DataError
 from dadiff.experts.lqr import GaussianLaw
-from dadiff.systems import Family, LinearSystem
+from dadiff.systems import Family, System
 from dadiff.trajectory import Layout
 
 if TYPE_CHECKING:
@@ -84,27 +84,27 @@ class Task(Protocol):
 
     horizon: int
 
-    def target(self, system: LinearSystem | Family) -> LinearSystem:
+    def target(self, system: System | Family) -> System:
         """The system, or the robots, that plans are made for. A task of one system returns it."""
         ...
 
-    def condition(self, system: LinearSystem) -> Layout:
+    def condition(self, system: System) -> Layout:
         """The channels of the condition vector E, x_init among them, for what `target` returned."""
         ...
 
-    def environment(self, system: LinearSystem, given: Mapping[str, object]) -> np.ndarray:
+    def environment(self, system: System, given: Mapping[str, object]) -> np.ndarray:
         """E (c,) of one environment that is given by its fields, each of them checked."""
         ...
 
-    def demonstrations(self, system: LinearSystem | Family, count: int, rng: np.random.Generator) -> Demonstrations:
+    def demonstrations(self, system: System | Family, count: int, rng: np.random.Generator) -> Demonstrations:
         """`count` expert demonstrations (a robot) in fresh environments."""
         ...
 
-    def cases(self, system: LinearSystem, count: int, rng: np.random.Generator) -> Cases:
+    def cases(self, system: System, count: int, rng: np.random.Generator) -> Cases:
         """`count` test cases (a robot) with references in fresh environments."""
         ...
 
-    def score(self, system: LinearSystem, cases: Cases, planned: np.ndarray, rollout: np.ndarray) -> Scores:
+    def score(self, system: System, cases: Cases, planned: np.ndarray, rollout: np.ndarray) -> Scores:
         """Scores of plans (*robots, cases, samples, d), as planned and after replaying their inputs."""
         ...
 
@@ -150,7 +150,7 @@ def numbers(value: object, field: str, shape: tuple[int, ...], place: str) -> np
 class Lawful(Protocol):
     """A task whose demonstrations have a Gaussian law given E, so that the exact denoiser is known."""
 
-    def law(self, system: LinearSystem) -> GaussianLaw:
+    def law(self, system: System) -> GaussianLaw:
         """The law of demonstrations given E."""
         ...
 

@@ -1,8 +1,9 @@
-"""Responses of a linear system over a horizon, and the trajectory map F (eq. 4 of the paper).
+"""Responses of linear systems over a horizon, and the trajectory map F (eq. 4 of the paper).
 
     x(0:T) = 𝒜 x(0) + 𝒞_T u(0:T-1),    tau = F [x(0); u(0:T-1)],    F = [[𝒜, 𝒞_T], [0, I]]
 
-Every function accepts leading batch dimensions on A and B: one matrix pair a robot. Robots come first.
+Matrices are given for every step, A (..., T, n, n) and B (..., T, n, m), so that they may vary; leading dimensions are
+robots. Where the dynamics have an offset c, tau = F [x(0); u] + the roll-out from rest without inputs.
 """
 
 from __future__ import annotations
@@ -12,57 +13,52 @@ import numpy as np
 from dadiff.trajectory.layout import TrajectoryLayout
 
 
-def layout_of(A: np.ndarray, B: np.ndarray, horizon: int) -> TrajectoryLayout:
-    """The layout of trajectories of (A (..., n, n), B (..., n, m)) over T inputs."""
-    return TrajectoryLayout(A.shape[-1], B.shape[-1], horizon)
+def layout_of(A: np.ndarray, B: np.ndarray) -> TrajectoryLayout:
+    """The layout of trajectories of (A (..., T, n, n), B (..., T, n, m))."""
+    return TrajectoryLayout(A.shape[-1], B.shape[-1], A.shape[-3])
 
 
-def powers(A: np.ndarray, horizon: int) -> np.ndarray:
-    """I, A, ..., A^T of shape (..., T+1, n, n)."""
-    n = A.shape[-1]
-    result = np.empty((*A.shape[:-2], horizon + 1, n, n))
-    result[..., 0, :, :] = np.eye(n)
-    for t in range(horizon):
-        result[..., t + 1, :, :] = A @ result[..., t, :, :]
-    return result
+def free_response(A: np.ndarray) -> np.ndarray:
+    """𝒜 = [I; A_0; A_1 A_0; ...] of shape (..., n(T+1), n)."""
+    *lead, T, n, _ = A.shape
+    blocks = np.empty((*lead, T + 1, n, n))
+    blocks[..., 0, :, :] = np.eye(n)
+    for t in range(T):
+        blocks[..., t + 1, :, :] = A[..., t, :, :] @ blocks[..., t, :, :]
+    return blocks.reshape(*lead, -1, n)
 
 
-def free_response(A: np.ndarray, horizon: int) -> np.ndarray:
-    """𝒜 = [I; A; ...; A^T] of shape (..., n(T+1), n)."""
-    P = powers(A, horizon)
-    return P.reshape(*A.shape[:-2], -1, A.shape[-1])
+def forced_response(A: np.ndarray, B: np.ndarray) -> np.ndarray:
+    """𝒞_T of shape (..., n(T+1), mT): block (t, s) is A_(t-1) ... A_(s+1) B_s for s < t, else 0."""
+    *lead, T, n, m = B.shape
+    blocks = np.zeros((*lead, T + 1, n, T * m))
+    for t in range(T):
+        now, following = blocks[..., t, :, : t * m], blocks[..., t + 1, :, :]
+        following[..., : t * m] = A[..., t, :, :] @ now
+        following[..., t * m : (t + 1) * m] = B[..., t, :, :]
+    return blocks.reshape(*lead, -1, T * m)
 
 
-def forced_response(A: np.ndarray, B: np.ndarray, horizon: int) -> np.ndarray:
-    """𝒞_T of shape (..., n(T+1), mT): block (t, s) is A^(t-1-s) B for s < t, else 0."""
-    n, m = B.shape[-2:]
-    AB = powers(A, horizon - 1) @ B[..., None, :, :]  # A^k B for k = 0..T-1
-    C = np.zeros((*A.shape[:-2], horizon + 1, n, horizon, m))
-    for s in range(horizon):
-        C[..., s + 1 :, :, s, :] = AB[..., : horizon - s, :, :]
-    return C.reshape(*A.shape[:-2], n * (horizon + 1), horizon * m)
-
-
-def trajectory_map(A: np.ndarray, B: np.ndarray, horizon: int) -> np.ndarray:
+def trajectory_map(A: np.ndarray, B: np.ndarray) -> np.ndarray:
     """F = [[𝒜, 𝒞_T], [0, I]] of shape (..., d, n + mT), eq. (4)."""
-    layout = layout_of(A, B, horizon)
-    F = np.zeros((*A.shape[:-2], layout.size, layout.rank))
-    F[..., layout.all_states, layout.initial_state] = free_response(A, horizon)
-    F[..., layout.all_states, layout.state_dim :] = forced_response(A, B, horizon)
-    F[..., layout.all_inputs, layout.state_dim :] = np.eye(layout.input_dim * horizon)
+    layout = layout_of(A, B)
+    F = np.zeros((*A.shape[:-3], layout.size, layout.rank))
+    F[..., layout.all_states, layout.initial_state] = free_response(A)
+    F[..., layout.all_states, layout.state_dim :] = forced_response(A, B)
+    F[..., layout.all_inputs, layout.state_dim :] = np.eye(layout.rank - layout.state_dim)
     return F
 
 
-def dynamics_matrix(A: np.ndarray, B: np.ndarray, horizon: int) -> np.ndarray:
-    """G of shape (..., nT, d) with G tau = [x(t+1) - A x(t) - B u(t)] for t = 0..T-1.
+def dynamics_matrix(A: np.ndarray, B: np.ndarray) -> np.ndarray:
+    """G of shape (..., nT, d) with G tau = [x(t+1) - A_t x(t) - B_t u(t)] for t = 0..T-1.
 
-    im F is its kernel. G holds no powers of A, so that the kernel is found well however fast A^t grows.
+    im F is its kernel. G holds no products of A, so that the kernel is found well however fast they grow.
     """
-    layout = layout_of(A, B, horizon)
-    unit = np.broadcast_to(np.eye(layout.size), (*A.shape[:-2], layout.size, layout.size))
-    x, u = layout.split(unit)
-    residual = x[..., 1:, :] - along(A, x[..., :-1, :]) - along(B, u)
-    return residual.reshape(*A.shape[:-2], layout.size, -1).swapaxes(-1, -2)
+    layout = layout_of(A, B)
+    unit = np.broadcast_to(np.eye(layout.size), (*A.shape[:-3], layout.size, layout.size))
+    x, u = (part.swapaxes(-2, -3) for part in layout.split(unit))  # time before the columns of the identity
+    residual = x[..., 1:, :, :] - along(A, x[..., :-1, :, :]) - along(B, u)
+    return residual.swapaxes(-2, -3).reshape(*A.shape[:-3], layout.size, -1).swapaxes(-1, -2)
 
 
 def along(M: np.ndarray, vectors: np.ndarray) -> np.ndarray:
@@ -77,16 +73,21 @@ def along(M: np.ndarray, vectors: np.ndarray) -> np.ndarray:
     return result.reshape(*result.shape[: len(lead)], *vectors.shape[len(lead) : -1], M.shape[-2])
 
 
+def beside(c: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """c (*robots, n) with as many dimensions as the vectors (*robots, ..., n) that it is added to."""
+    return c.reshape(*c.shape[:-1], *(1,) * (vectors.ndim - c.ndim), c.shape[-1])
+
+
 def simulate(
     A: np.ndarray, B: np.ndarray, x_init: np.ndarray, inputs: np.ndarray, noise: np.ndarray | None = None
 ) -> np.ndarray:
-    """Roll out x(t+1) = A x(t) + B u(t) + w(t), eq. (1).
+    """Roll out x(t+1) = A x(t) + B u(t) + w(t), eq. (1), with A and B that do not vary.
 
     Args:
         A, B: (*robots, n, n) and (*robots, n, m).
         x_init: (*robots, ..., n); what stands between may broadcast against the inputs.
         inputs: (*robots, ..., T, m).
-        noise: (*robots, ..., T, n) or None for none.
+        noise: w, all that is added, (*robots, ..., T, n), or None for none.
 
     Returns:
         States x(0:T) of shape (*robots, ..., T+1, n). Values that leave float range stay inf or nan.

@@ -15,7 +15,7 @@ from enum import IntEnum
 import numpy as np
 
 from dadiff.errors import ConfigError
-from dadiff.systems import LinearSystem
+from dadiff.systems import Linear, System
 
 TOLERANCE = 1e-7
 """Metres by which a solution may enter an inflated disc."""
@@ -127,18 +127,19 @@ def solutions(problem: ObstacleProblem, positions: np.ndarray, status: np.ndarra
     return Solutions(positions, inputs, problem.cost(positions, inputs), status)
 
 
-def time_step_of(system: LinearSystem) -> float:
+def time_step_of(system: System) -> float:
     """dt of a planar double integrator in forward Euler form, A = [[I, dt I], [0, I]], B = [0; dt I].
 
     Raises:
         ConfigError: if the system is any other, as positions would not determine its inputs by second differences.
     """
-    if system.A.shape == (4, 4) and system.B.shape == (4, 2):
+    if isinstance(system, Linear) and system.A.shape == (4, 4) and system.B.shape == (4, 2) and not system.c.any():
         dt, zero, one = float(system.A[0, 2]), np.zeros((2, 2)), np.eye(2)
         A, B = np.block([[one, dt * one], [zero, one]]), np.vstack([zero, dt * one])
         if dt > 0 and np.allclose(system.A, A, atol=1e-12) and np.allclose(system.B, B, atol=1e-12):
             return dt
     raise ConfigError(
-        f"obstacles: the experts need one planar double integrator by forward Euler (n = 4, m = 2); found A of shape "
-        f"{system.A.shape}, B of shape {system.B.shape}; use system=double_integrator with discretisation=euler, axes=2"
+        "obstacles: the experts need one planar double integrator by forward Euler (n = 4, m = 2); found "
+        f"{type(system).__name__} with n = {system.state_dim}, m = {system.input_dim}; "
+        "use system=double_integrator with discretisation=euler, axes=2"
     )
