@@ -13,6 +13,7 @@ from dadiff.diffusion.context import Context, Counted, Denoise, Project, unproje
 from dadiff.diffusion.enforcement import Enforcement, Never
 from dadiff.diffusion.samplers import Sampler
 from dadiff.diffusion.schedule import Schedule
+from dadiff.diffusion.silence import begin
 from dadiff.trajectory.covariance import Covariance
 
 Tensor = torch.Tensor
@@ -58,7 +59,8 @@ def sample(
         shape: (*robots, ..., d) of the plans.
         generator: of all noise; on the CPU, so that the same seed gives the same noise on every device.
         project, enforcement: P and where it acts; None for vanilla diffusion.
-        observe: is shown the sample after each prediction, after each projection, and after the end's.
+        observe: is shown the sample after each prediction, after each projection, and after the end's; of leading
+            steps without a call that were drawn as one, what they end with.
         divergence_bound: the chain stops once max |tau| exceeds it.
         progress: show a progress bar.
         covariance: i -> C_i, of the clean estimate, for enforcements that weigh by it.
@@ -72,13 +74,17 @@ def sample(
 
     by = enforcement if enforcement and project else Never()
     ask, memory = Counted(denoise), dict[str, Any]()
-    bar = tqdm(sampler.steps(schedule), desc="sampling", unit="step", disable=None if progress else True, leave=False)
-    tau = noise()  # line 1: tau_L ~ N(0, I)
+    tau, steps = begin(sampler.steps(schedule), schedule, noise, project or unprojected, by)  # line 1: tau_L ~ N(0, I)
+    if observe and steps[0].i < schedule.num_steps:
+        observe(steps[0].i, "project", tau)
+    tau0_hat = torch.zeros_like(tau)
+    bar = tqdm(steps, desc="sampling", unit="step", disable=None if progress else True, leave=False)
     for step in bar:  # line 2: for i = L, ..., 1
         at = Context(step, schedule, tau, environment, project or unprojected, ask, noise, covariance, memory)
         mean = step.sample * tau
         if step.call:  # line 3: the clean estimate from tau_i, i and E, and the mean that follows from it
-            mean = mean + step.clean * by.clean(ask(tau, step.i, environment), at)
+            before, tau0_hat = tau0_hat, by.clean(ask(tau, step.i, environment), at)
+            mean = mean + step.clean * tau0_hat + step.previous * before
         tau = mean + step.noise * noise() if step.noise else mean  # line 4: predict
         if observe:
             observe(step.j, "predict", tau)

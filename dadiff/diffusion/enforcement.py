@@ -13,6 +13,7 @@ from math import sqrt
 from typing import ClassVar, Literal, Protocol
 
 from dadiff.diffusion.context import Context
+from dadiff.diffusion.schedule import Schedule
 from dadiff.trajectory.layout import Array
 
 
@@ -26,6 +27,8 @@ class Enforcement(Protocol):
     def sample(self, tau: Array, at: Context) -> Array: ...
 
     def end(self, tau: Array, at: Context) -> Array: ...
+
+    def keeps(self, schedule: Schedule, j: int) -> float | None: ...
 
 
 @dataclass(frozen=True)
@@ -46,6 +49,10 @@ class Never:
         """tau."""
         return tau
 
+    def keeps(self, schedule: Schedule, j: int) -> float | None:
+        """k where `sample` is P(tau) + k (tau - P(tau)): 1 where it does nothing, None where it is something else."""
+        return 1.0
+
 
 @dataclass(frozen=True)
 class PostHoc(Never):
@@ -65,6 +72,10 @@ class Normalised(Never):
         projected = at.project(tau)
         return projected + sqrt(at.beta) * (tau - projected)
 
+    def keeps(self, schedule: Schedule, j: int) -> float | None:
+        """sqrt(beta_j)."""
+        return sqrt(schedule.beta[j])
+
 
 @dataclass(frozen=True)
 class Convex(Never):
@@ -83,6 +94,10 @@ class Convex(Never):
     def sample(self, tau: Array, at: Context) -> Array:
         """tau + a (P(tau) - tau), if it acts here."""
         return self._blend(tau, at) if self.acts_on == "sample" else tau
+
+    def keeps(self, schedule: Schedule, j: int) -> float | None:
+        """1 - a where it acts on the sample."""
+        return 1 - float(schedule.alpha_bar[j]) if self.acts_on == "sample" else 1.0
 
     @staticmethod
     def _blend(tau: Array, at: Context) -> Array:
@@ -110,3 +125,7 @@ class Literally(Never):
     def sample(self, tau: Array, at: Context) -> Array:
         """sqrt(1 - beta_j) P(tau) + sqrt(beta_j) tau."""
         return sqrt(1 - at.beta) * at.project(tau) + sqrt(at.beta) * tau
+
+    def keeps(self, schedule: Schedule, j: int) -> float | None:
+        """It grows what lies in im F, too."""
+        return None

@@ -55,6 +55,13 @@ class Schedule:
         """alpha_bar_i = prod_{s=1}^i alpha_s, (L+1,), with alpha_bar_0 = 1."""
         return np.cumprod(self.alpha)
 
+    @cached_property
+    def half_log_snr(self) -> np.ndarray:
+        """lambda_i = log(alpha_bar_i / (1 - alpha_bar_i)) / 2, (L+1,): +inf at i = 0, and -inf at L if beta_L = 1."""
+        with np.errstate(divide="ignore"):
+            log_alpha_bar = np.cumsum(np.log1p(-self.beta))
+            return (log_alpha_bar - np.log(-np.expm1(log_alpha_bar))) / 2
+
     def conditions(self) -> dict[str, bool]:
         """Which of the paper's conditions (C1)-(C3) hold.
 

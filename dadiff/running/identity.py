@@ -21,7 +21,7 @@ from dadiff.datasets.files import FromFiles
 from dadiff.datasets.generated import PARTS, Dataset
 from dadiff.running.parts import Parts
 
-FORMAT = 1  # raised whenever a change moves results; see CHANGELOG
+FORMAT = 2  # raised whenever a change moves results; see CHANGELOG
 
 
 @dataclass(frozen=True)
