@@ -14,6 +14,7 @@ from dadiff.behaviours import (
     Hankel,
     HankelLowRank,
     Identified,
+    IdentifiedSoft,
     Inpainting,
     Known,
     NoProjector,
@@ -23,6 +24,7 @@ from dadiff.behaviours import (
     Span,
     Stages,
     Transitions,
+    Uncertain,
     compared,
     least_squares,
     pins,
@@ -123,11 +125,12 @@ class TestEveryProjector:
         recording = exciting(60).record(robots)
         x_init, z = np.random.default_rng(1).standard_normal((3, PLANS, 3)), generic(robots, 3, PLANS)
         where, layout = scaled(robots), robots.layout(HORIZON)
-        fitted = projector.fit(layout, system=robots, recording=recording)
+        shown = generic(robots, 20)
+        fitted = projector.fit(layout, robots, recording, shown)
         together = fitted.bind(where, pins(projector, layout, x_init))(z)
         for k, robot in enumerate(members(robots)):
             own = Recording(recording.states[k], recording.inputs[k])
-            alone = projector.fit(layout, system=robot, recording=own)
+            alone = projector.fit(layout, robot, own, shown)
             one = alone.bind(where, pins(projector, layout, x_init[k]))(z[k])
             np.testing.assert_allclose(together[k], one, atol=close(robots))
 
@@ -323,7 +326,7 @@ def test_a_recording_under_feedback_is_refused_with_its_rank_and_the_needed_one(
     found = layout.rank - layout.input_dim if process_noise else layout.state_dim
     from_hankel = f"have rank {found}, n \\+ mT = {layout.rank} are needed"
     with pytest.raises(ExcitationError, match=f"{from_hankel}|span 4 dimensions, n \\+ m = 6 are needed"):
-        projector.fit(layout, system, Recording(states, -states[:, :-1] @ gain.T))
+        projector.fit(layout, system, Recording(states, -states[:, :-1] @ gain.T), generic(system, 5))
 
 
 @pytest.mark.parametrize("projector", LEARNED.values(), ids=LEARNED.keys())
@@ -333,7 +336,7 @@ def test_a_recording_without_inputs_is_refused(projector, process_noise):
     silent = GaussianExcitation(length=100, input_std=0.0, process_noise=process_noise).record(system)
     found = system.state_dim if process_noise else 0
     with pytest.raises(ExcitationError, match=f"(have rank|span) {found}[ ,]"):
-        projector.fit(system.layout(HORIZON), system, silent)
+        projector.fit(system.layout(HORIZON), system, silent, generic(system, 5))
 
 
 def test_robots_whose_recordings_differ_in_rank_are_refused():
@@ -506,3 +509,71 @@ def test_demonstrations_are_data_about_the_dynamics_too():
     many = fleet()
     with pytest.raises(ConfigError, match="the demonstrations are of many robots"):
         Identified(learn_from="demonstrations").fit(many.layout(HORIZON), many, None, np.zeros((9, 39)))
+
+
+# --- dynamics that are known up to what data leave open
+
+
+@pytest.mark.parametrize("held", [(), ("initial_state",)], ids=["free", "x(0)"])
+@pytest.mark.parametrize("robots", [SYSTEMS["n=5,m=2"], fleet()], ids=["one", "fleet"])
+def test_an_uncertain_set_is_a_kalman_update_in_both_forms(monkeypatch, robots, held):
+    layout, rng = robots.layout(6), np.random.default_rng(3)
+    stages, d, q = varying(robots, 6), robots.layout(6).size, 7
+    V, C = rng.standard_normal((*robots.robots, 6 * layout.state_dim, q)), METRICS["low rank"](d)
+    z, eps = rng.standard_normal((2, *robots.robots, PLANS, d))
+    G, g = stages.matrix(layout)
+    rows, x_init = np.eye(d)[: layout.state_dim] if held else np.zeros((0, d)), held_pins(held, layout, robots.robots)
+    for largest in (d, 0):
+        monkeypatch.setattr(sets, "DENSE_UP_TO", largest)
+        P = Uncertain(layout, stages, V).bind(pins=x_init)
+        for k in np.ndindex(robots.robots):
+            stacked = np.concatenate([rows, G[k]])
+            R = np.zeros((len(stacked), len(stacked)))
+            R[len(rows) :, len(rows) :] = V[k] @ V[k].T
+            values = (
+                np.concatenate([x_init[0].values[k], np.tile(g[k], (PLANS, 1))], -1)
+                if held
+                else np.tile(g[k], (PLANS, 1))
+            )
+            K = C.matrix @ stacked.T @ np.linalg.inv(stacked @ C.matrix @ stacked.T + R)
+            expected = z[k] - (z[k] @ stacked.T - values) @ K.T
+            np.testing.assert_allclose(P(z, C)[k], expected, atol=1e-8)
+            drawn = expected + eps[k][:, :q] @ (K[:, len(rows) :] @ V[k]).T
+            np.testing.assert_allclose(P(z, C, noise=eps)[k], drawn, atol=1e-8)
+        tensors = P(torch.from_numpy(z), C, noise=torch.from_numpy(eps))
+        np.testing.assert_allclose(tensors.numpy(), P(z, C, noise=eps), atol=1e-10)
+
+
+def test_a_direction_that_is_not_known_is_not_projected(system):
+    layout, z = system.layout(HORIZON), generic(system, PLANS)
+    stages = Stages.constant(system.A, system.B, None, HORIZON)
+    for scale, expected in ((1e-9, bind(Known(), system, z)(z)), (1e9, z)):
+        V = scale * np.eye(HORIZON * system.state_dim)
+        np.testing.assert_allclose(Uncertain(layout, stages, V).bind()(z), expected, atol=1e-6)
+
+
+def test_the_residual_of_true_trajectories_has_the_stated_covariance():
+    """Over many recordings, G_hat tau of demonstrations is as large as R says, time by time."""
+    system, layout = double_integrator(process_noise=0.02), double_integrator().layout(HORIZON)
+    shown = trajectories(system, HORIZON, 50)[0]
+    found, stated = [], []
+    for seed in range(150):
+        recording = GaussianExcitation(length=300, seed=seed).record(system)
+        fitted = IdentifiedSoft().fit(layout, system, recording, shown)
+        found.append(np.square(fitted.stages.residual(layout, shown)).mean(axis=-2))
+        stated.append(np.square(fitted.spread).sum(axis=-1).reshape(HORIZON, -1))
+    np.testing.assert_allclose(np.mean(found, axis=(0, 2)), np.mean(stated, axis=(0, 2)), rtol=0.2)
+
+
+def test_with_more_data_it_becomes_the_hard_projection():
+    system, layout = double_integrator(process_noise=0.02), double_integrator().layout(HORIZON)
+    shown, z = trajectories(system, HORIZON, 200)[0], generic(system, 20)
+    apart, deviations = [], []
+    for length, learn_from in ((20, "recording"), (400, "recording"), (400, "both")):
+        recording = GaussianExcitation(length=length, process_noise=0.5, seed=1).record(system)
+        given = (layout, system, recording, shown)
+        soft, hard = (kind(learn_from=learn_from).fit(*given) for kind in (IdentifiedSoft, Identified))
+        apart.append(np.abs(soft.bind()(z) - hard.bind()(z)).mean())
+        deviations.append(soft.notes["residual_deviation"])
+    assert apart[0] > 5 * apart[1] > 5 * apart[2]
+    assert deviations[0] > 3 * deviations[1] > 3 * deviations[2]

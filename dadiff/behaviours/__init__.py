@@ -4,6 +4,7 @@ from dadiff.behaviours.components import (
     Hankel,
     HankelLowRank,
     Identified,
+    IdentifiedSoft,
     Inpainting,
     Known,
     NoProjector,
@@ -14,7 +15,7 @@ from dadiff.behaviours.components import (
 from dadiff.behaviours.least_squares import Estimate, Transitions, least_squares
 from dadiff.behaviours.pins import Pin
 from dadiff.behaviours.projection import Projection, ProjectionInfo
-from dadiff.behaviours.sets import Dynamics, Everything, Rollout, Span, TrajectorySet, compared
+from dadiff.behaviours.sets import Dynamics, Everything, Rollout, Span, TrajectorySet, Uncertain, compared
 from dadiff.behaviours.stages import Stages
 
 __all__ = [
@@ -24,6 +25,7 @@ __all__ = [
     "Hankel",
     "HankelLowRank",
     "Identified",
+    "IdentifiedSoft",
     "Inpainting",
     "Known",
     "NoProjector",
@@ -37,6 +39,7 @@ __all__ = [
     "Stages",
     "TrajectorySet",
     "Transitions",
+    "Uncertain",
     "compared",
     "least_squares",
     "pins",

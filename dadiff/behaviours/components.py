@@ -13,7 +13,7 @@ import numpy as np
 
 from dadiff.behaviours.least_squares import Offset, Transitions, least_squares
 from dadiff.behaviours.pins import Pin
-from dadiff.behaviours.sets import Dynamics, Everything, InitialState, Rollout, Span, TrajectorySet
+from dadiff.behaviours.sets import Dynamics, Everything, InitialState, Rollout, Span, TrajectorySet, Uncertain
 from dadiff.behaviours.stages import stages_of
 from dadiff.errors import ConfigError, ExcitationError
 from dadiff.systems import Recording, System
@@ -202,6 +202,37 @@ class Identified:
 
 
 @dataclass(frozen=True)
+class IdentifiedSoft(Identified):
+    """Dynamics estimated by least squares, each direction trusted by how well it is known.
+
+    The estimate's posterior covariance says how far a trajectory of the true system may lie from G tau = g; it is
+    averaged over the demonstrations. See `dadiff.behaviours.Uncertain`; `enforcement=conditional` weighs it against
+    what the denoiser leaves open. With much data it is `Identified`, with little it projects hardly.
+    """
+
+    @property
+    def needs(self) -> frozenset[str]:
+        """What it learns from, and demonstrations, which say what trajectories look like."""
+        return super().needs | {"demonstrations"}
+
+    def fit(
+        self,
+        layout: TrajectoryLayout,
+        system: System | None = None,
+        recording: Recording | None = None,
+        demonstrations: np.ndarray | None = None,
+    ) -> Uncertain:
+        """The estimated dynamics, and the covariance of the residual."""
+        shown = _required(demonstrations, "identified_soft", "dataset")
+        data = transitions(self, layout, system, recording, demonstrations)
+        estimate = least_squares(data, self.offset, known_offset(self, system))
+        spread = estimate.residual_spread(*layout.split(shown))
+        deviation = float(np.sqrt(np.square(spread).sum(axis=-1).mean()))
+        notes = {"rank": layout.rank, "residual_deviation": deviation}
+        return Uncertain(layout, estimate.stages(layout.horizon), spread, notes=notes)
+
+
+@dataclass(frozen=True)
 class RolloutProjector:
     """Keeps the planned inputs and recomputes the states from x_init with known dynamics."""
 
@@ -233,10 +264,10 @@ def transitions(
         ConfigError: if a source is missing, or the demonstrations are of many robots.
     """
     found = []
-    if "recording" in projector.needs:
+    if projector.learn_from != "demonstrations":
         recording = _required(recording, "identified", "recording")
         found.append(Transitions.of(recording.states, recording.inputs))
-    if "demonstrations" in projector.needs:
+    if projector.learn_from != "recording":
         trajectories = _required(demonstrations, "identified", "dataset")
         robots = found[0].x.shape[:-2] if found else () if system is None else system.robots
         if robots not in ((), (1,)):

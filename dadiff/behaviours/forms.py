@@ -10,7 +10,7 @@ C is what remains. In the identity metric nothing moves along.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -31,7 +31,7 @@ class Rows:
     Args:
         G: (*robots, q, d).
         g: (*robots, q).
-        noise: R of shape (*robots, q, q), or None for none.
+        noise: V of shape (*robots, q, p) with R = V V', or None for R = 0.
     """
 
     G: np.ndarray = field(repr=False)
@@ -121,14 +121,15 @@ def in_metric(rows: Rows, metric: Covariance, places: np.ndarray, where: Coordin
     given, gain = metric.given(places)
     C, d = given.matrix, metric.size
     inner = rows.G @ C @ transposed(rows.G)
-    inner = inner if rows.noise is None else inner + rows.noise
+    inner = inner if rows.noise is None else inner + rows.noise @ transposed(rows.noise)
     K = C @ transposed(rows.G) @ semidefinite_inverse(inner)
     correct = np.eye(d) - K @ rows.G
     moved = np.eye(d) - _columns(gain, places, d)
     lift = gain.copy()
     moved[..., places, :], lift[..., places, :] = 0, np.eye(len(places))
     centre = (K @ rows.g[..., None])[..., 0]
-    return _pinned_map(correct @ moved, centre, correct @ lift, places, where, orthogonal=False)
+    made = _pinned_map(correct @ moved, centre, correct @ lift, places, where, orthogonal=False)
+    return made if rows.noise is None else replace(made, spread=K @ rows.noise)
 
 
 def _columns(gain: np.ndarray, places: np.ndarray, d: int) -> np.ndarray:
@@ -162,7 +163,7 @@ class Hold:
         """The values themselves."""
         return values
 
-    def __call__(self, z: Array, given: Array) -> Array:
+    def __call__(self, z: Array, given: Array, noise: Array | None = None) -> Array:
         """See `Form`."""
         return (self.pin(z * self.scale + self.mean, given) - self.mean) / self.scale
 
@@ -187,7 +188,8 @@ class Blocks:
     Args:
         hold: the pins, and the coordinates.
         factor: U of shape (*robots, d, p), given the pins.
-        low_rank, correction: L and H, (*robots, nT, p + q), in the order of `_rows`.
+        noise: V of shape (*robots, nT, q), in the order of `_rows`.
+        low_rank, correction: L and H, (*robots, nT, p + q), likewise.
     """
 
     layout: TrajectoryLayout
@@ -195,6 +197,7 @@ class Blocks:
     factorised: BlockTridiagonal
     hold: Hold
     factor: np.ndarray = field(repr=False)
+    noise: np.ndarray = field(repr=False)
     low_rank: np.ndarray = field(repr=False)
     correction: np.ndarray = field(repr=False)
 
@@ -220,20 +223,24 @@ class Blocks:
         linear = Stages(stages.A, stages.B, np.zeros_like(stages.c))
         factor = np.broadcast_to(given.factor, (*stages.robots, *given.factor.shape[-2:]))
         G_U = transposed(_rows(linear.residual(layout, transposed(factor))))
-        low_rank = G_U if noise is None else np.concatenate([G_U, noise], axis=-1)
+        noise = np.zeros((*G_U.shape[:-1], 0)) if noise is None else noise
+        low_rank = np.concatenate([G_U, noise], axis=-1)
         solved = transposed(_rows(factorised.solve(_stagewise(transposed(low_rank), layout))[0]))
         small = np.eye(low_rank.shape[-1]) + transposed(low_rank) @ solved
         correction = transposed(np.linalg.solve(small, transposed(solved)))
-        return cls(layout, stages, factorised, hold, given.factor, low_rank, correction)
+        return cls(layout, stages, factorised, hold, given.factor, noise, low_rank, correction)
 
     def given(self, values: np.ndarray) -> np.ndarray:
         """The values themselves."""
         return values
 
-    def __call__(self, z: Array, given: Array) -> Array:
+    def __call__(self, z: Array, given: Array, noise: Array | None = None) -> Array:
         """See `Form`."""
         tau = self.hold.pin(z * self.hold.scale + self.hold.mean, given)
         residual = self.stages.residual(self.layout, tau)
+        if noise is not None and self.noise.shape[-1]:
+            drawn = noise[..., : self.noise.shape[-1]] @ transposed(self.noise)
+            residual = residual - _stagewise(drawn, self.layout)
         if self.low_rank.shape[-1]:
             known = (_rows(residual) @ self.correction) @ transposed(self.low_rank)
             residual = residual - _stagewise(known, self.layout)

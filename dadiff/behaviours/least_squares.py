@@ -15,6 +15,8 @@ from dadiff.behaviours.stages import Stages, transposed
 from dadiff.errors import ExcitationError
 from dadiff.trajectory.subspace import numerical_rank
 
+ROUNDING = 1e-13
+
 Offset = Literal["none", "estimated", "known"]
 
 
@@ -65,6 +67,33 @@ class Estimate:
     def stages(self, horizon: int) -> Stages:
         """The same dynamics at every stage."""
         return Stages.constant(self.A, self.B, self.c, horizon)
+
+    def residual_spread(self, states: np.ndarray, inputs: np.ndarray) -> np.ndarray:
+        """V with V V' = R, the covariance of G tau - g that the estimate's error causes, averaged over trajectories.
+
+            R_ts = trace((Phi' Phi)^-1 E[phi(s) phi(t)']) diag(noise),    phi = [x; u; 1]
+
+        Args:
+            states: (N, T+1, n).
+            inputs: (N, T, m).
+
+        Returns:
+            (*robots, nT, q), stage by stage; what is below rounding is left out.
+        """
+        ones = np.ones((*inputs.shape[:-1], self.spread.shape[-1] - self.A.shape[-1] - inputs.shape[-1]))
+        phi = np.concatenate([states[..., :-1, :], inputs, ones], axis=-1)
+        weighed = phi.reshape(-1, phi.shape[-1]) @ np.linalg.cholesky(self.spread)
+        weighed = weighed.reshape(*self.spread.shape[:-2], *phi.shape)
+        kernel = np.einsum("...atp,...asp->...ts", weighed, weighed, optimize=True) / len(phi)
+        values, vectors = np.linalg.eigh(kernel)
+        kept = (values > ROUNDING * values[..., -1:]).reshape(-1, values.shape[-1]).any(axis=0)
+        root = vectors[..., kept] * np.sqrt(np.maximum(values[..., kept], 0))[..., None, :]
+        V = root[..., :, None, :, None] * _diagonal(np.sqrt(self.noise))[..., None, :, None, :]
+        return V.reshape(*V.shape[:-4], V.shape[-4] * V.shape[-3], V.shape[-2] * V.shape[-1])
+
+
+def _diagonal(values: np.ndarray) -> np.ndarray:
+    return values[..., :, None] * np.eye(values.shape[-1])
 
 
 def least_squares(data: Transitions, offset: Offset = "none", known: np.ndarray | None = None) -> Estimate:

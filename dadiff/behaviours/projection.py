@@ -49,35 +49,40 @@ class Form(Protocol):
         """What follows from the pins' values (*robots, plans, k), computed once."""
         ...
 
-    def __call__(self, z: Array, given: Array) -> Array:
-        """Project z (*robots, plans, d)."""
+    def __call__(self, z: Array, given: Array, noise: Array | None = None) -> Array:
+        """Project z (*robots, plans, d); `noise` of that shape stands for the spread of a residual that has one."""
         ...
 
 
 @dataclass(frozen=True)
 class AffineMap:
-    """z -> matrix z + centre + lift values, or synthesis synthesis' z where the matrix is orthogonal.
+    """z -> matrix z + centre + lift values + spread eps, or basis basis' z + ... where the matrix is orthogonal.
 
     Args:
-        matrix: (*robots, d, d), or synthesis (*robots, d, r).
+        matrix: (*robots, d, d), or a basis (*robots, d, r).
         centre: (*robots, d).
         lift: (*robots, d, k).
         orthogonal: whether `matrix` is an orthonormal basis of what is projected onto.
+        spread: (*robots, d, q), by which the residual's unit noise moves z; None where the residual has none.
     """
 
     matrix: np.ndarray = field(repr=False)
     centre: np.ndarray = field(repr=False)
     lift: np.ndarray = field(repr=False)
     orthogonal: bool = True
+    spread: np.ndarray | None = field(default=None, repr=False)
 
     def given(self, values: np.ndarray) -> np.ndarray:
         """The offset of each plan, (*robots, plans, d)."""
         return self.centre[..., None, :] + values @ self.lift.swapaxes(-1, -2)
 
-    def __call__(self, z: Array, given: Array) -> Array:
+    def __call__(self, z: Array, given: Array, noise: Array | None = None) -> Array:
         """Project z (*robots, plans, d): all plans of a robot in one product."""
         coefficients = z @ self.matrix if self.orthogonal else z
-        return coefficients @ self.matrix.swapaxes(-1, -2) + given
+        image = coefficients @ self.matrix.swapaxes(-1, -2) + given
+        if self.spread is None or noise is None:
+            return image
+        return image + noise[..., : self.spread.shape[-1]] @ self.spread.swapaxes(-1, -2)
 
 
 class Geometry:
@@ -122,7 +127,13 @@ class Projection:
         self._converted: dict[object, tuple[Form, Array, Form]] = {}
         self.info = ProjectionInfo(geometry.rank, geometry.kind)
 
-    def __call__(self, tau: Array, metric: Covariance | None = None, start: Array | None = None) -> Array:
+    def __call__(
+        self,
+        tau: Array,
+        metric: Covariance | None = None,
+        start: Array | None = None,
+        noise: Array | None = None,
+    ) -> Array:
         """The projection of tau.
 
         Args:
@@ -130,6 +141,8 @@ class Projection:
             metric: C in those coordinates; the correction is then C G' (G C G' + R)^-1 (G tau - g). None is the
                 identity. What follows from a C is computed once for the object.
             start: where to begin; a closed form needs none.
+            noise: unit noise of the shape of tau, from which an uncertain set draws its residual r ~ N(0, R): with tau
+                drawn from N(tau0_hat, C) the projection is then a draw of the conditional law (Matheron's rule).
 
         Raises:
             ShapeError: if tau does not fit the robots.
@@ -141,9 +154,12 @@ class Projection:
                 f"{tuple(tau.shape)}; build the projector from these robots' systems or recordings"
             )
         if self._geometry.kind == "blocks" and not isinstance(tau, np.ndarray) and tau.device.type == "cpu":
-            return tau.new_tensor(self(tau.numpy(), metric))  # many small products, which numpy starts faster
+            # Many small products, which numpy starts faster.
+            drawn = None if noise is None else noise.numpy()
+            return tau.new_tensor(self(tau.numpy(), metric, start, drawn))
         form, given = self._bound(self._geometry.form(metric), tau)
-        return form(tau.reshape(*robots, -1, d), given).reshape(tau.shape)
+        drawn = None if noise is None else noise.reshape(*robots, -1, d)
+        return form(tau.reshape(*robots, -1, d), given, drawn).reshape(tau.shape)
 
     def on(self, device: str) -> Projection:
         """Itself, with what projects float64 tensors in the identity metric on a device."""

@@ -4,6 +4,7 @@ A set is found once. `bind` gives the projection onto it in some coordinates, wi
 plan; what does not depend on the pins' values is computed once for the set.
 
     Dynamics   G tau = g with the stages of x(t+1) = A_t x(t) + B_t u(t) + c_t
+    Uncertain  G tau = g + r with r ~ N(0, R): dynamics that are known up to what data leave open
     Span       { origin + basis h : h in R^r }
     Rollout    keeps the inputs and recomputes the states: an oblique projection
     Everything all trajectories: only the pins are held
@@ -147,6 +148,30 @@ class Dynamics(AffineSet):
 
 
 @dataclass(frozen=True)
+class Uncertain(Dynamics):
+    """Estimated dynamics, trusted in each direction by how well it is known: G tau = g + r with r ~ N(0, R).
+
+    Its projection is a Kalman update, tau - C G' (G C G' + R)^-1 (G tau - g), which weighs C against R: C must be a
+    covariance in earnest. It is no projection onto a set: applied twice it moves twice.
+
+    Args:
+        spread: V of shape (*robots, nT, q) with R = V V', stage by stage.
+    """
+
+    spread: np.ndarray = field(repr=False)
+
+    def geometry(self, where: Coordinates, places: np.ndarray) -> Geometry:
+        """As `Dynamics.geometry`."""
+        rank = self.layout.rank - len(places)
+        if self.layout.size > DENSE_UP_TO:
+            weighted = partial(Blocks.of, self.layout, self.stages, places=places, where=where, noise=self.spread)
+            return Geometry(rank, "blocks", partial(weighted, identity(self.layout)), weighted)
+        rows = Rows(*self.stages.matrix(self.layout), self.spread).scaled(where)
+        dense = partial(in_metric, rows, places=places, where=where)
+        return Geometry(rank, "dense", partial(dense, identity(self.layout)), dense)
+
+
+@dataclass(frozen=True)
 class Span(AffineSet):
     """{ origin + basis h : h in R^r } in physical units.
 
@@ -210,7 +235,7 @@ class RolledOut:
         """x(0) itself."""
         return values
 
-    def __call__(self, z: Array, given: Array) -> Array:
+    def __call__(self, z: Array, given: Array, noise: Array | None = None) -> Array:
         """See `Form`."""
         inputs = self.layout.inputs(z * self.scale + self.mean)
         x_init = given + 0 * inputs[..., 0, :1]  # one for each plan

@@ -80,6 +80,16 @@ class Covariance:
         """S C S with S = diag(scale): the covariance of S z from that of z."""
         return Covariance(scale**2 * self.diagonal, scale[:, None] * self.factor)
 
+    def leading(self, count: int) -> Covariance:
+        """The `count` leading directions of C, and of the others the variances alone: diag(D) + U U' with k = count.
+
+        The variance of every entry is kept.
+        """
+        values, vectors = np.linalg.eigh(self.matrix)
+        factor = vectors[..., self.size - count :] * np.sqrt(np.maximum(values[..., None, self.size - count :], 0))
+        rest = np.einsum("...ii->...i", self.matrix) - np.square(factor).sum(axis=-1)
+        return Covariance(np.maximum(rest, 0), factor)
+
     def given(self, places: Sequence[int] | np.ndarray) -> tuple[Covariance, np.ndarray]:
         """What is left once entries E z (k,) are known, and the gain with which they move the others.
 

@@ -8,6 +8,8 @@ robots. Where the dynamics have an offset c, tau = F [x(0); u] + the roll-out fr
 
 from __future__ import annotations
 
+from math import prod
+
 import numpy as np
 
 from dadiff.trajectory.layout import TrajectoryLayout
@@ -68,7 +70,7 @@ def along(M: np.ndarray, vectors: np.ndarray) -> np.ndarray:
     product serves them all.
     """
     lead = M.shape[:-2]
-    flat = vectors.reshape(*vectors.shape[: len(lead)], -1, vectors.shape[-1])
+    flat = vectors.reshape(*vectors.shape[: len(lead)], prod(vectors.shape[len(lead) : -1]), vectors.shape[-1])
     result = flat @ M.swapaxes(-1, -2)
     return result.reshape(*result.shape[: len(lead)], *vectors.shape[len(lead) : -1], M.shape[-2])
 
