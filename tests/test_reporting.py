@@ -28,6 +28,7 @@ from dadiff.reporting.report import build
 from dadiff.reporting.selection import matches
 from dadiff.reporting.sources import read_sweeps, without_password
 from dadiff.reporting.statistics import ratio
+from dadiff.store import Results
 
 STORE = Path(__file__).parent / "data" / "store"
 EXPECTED = Path(__file__).parent / "data" / "expected"
@@ -359,7 +360,7 @@ def test_rows_that_are_missing_from_a_table_are_an_error(tmp_path):
     key = store.run(1.0)
     store.sweep()
     (cell,) = read_sweeps(tmp_path, [store.name]).cells
-    cell.table("per_step").iloc[:-1].to_parquet(tmp_path / "runs" / key / "per_step.parquet")
+    Results(tmp_path).write(Results(tmp_path).read(key).record, tables={"per_step": cell.table("per_step").iloc[:-1]})
     shutil.copytree(tmp_path, tmp_path.with_name("copy"))
     everything = Evidence(read_sweeps(tmp_path.with_name("copy"), [store.name]))
     with pytest.raises(StoreError, match="expected each once"):

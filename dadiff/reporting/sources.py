@@ -17,9 +17,8 @@ import pandas as pd
 
 from dadiff.errors import StoreError
 from dadiff.store import Record, Results, StoredRun, Sweeps
-from dadiff.store.files import read_json
 from dadiff.store.results import read_table
-from dadiff.tracking.markers import MARKER
+from dadiff.tracking.markers import MARKER, read_markers
 
 LOCAL_UI = "http://127.0.0.1:5000"
 """Where `mlflow ui` answers."""
@@ -104,8 +103,8 @@ class Cell:
         path = self.run.folder / MARKER if self.run else None
         if path is None or not path.is_file():
             return []
-        stores = read_json(path)["stores"].items()
-        return [f"{_server(uri)}/#/experiments/{m['experiment_id']}/runs/{m['run_id']}" for uri, m in stores]
+        stores = read_markers(path.parent).items()
+        return [f"{_server(uri)}/#/experiments/{m.experiment_id}/runs/{m.run_id}" for uri, m in stores]
 
     @property
     def metrics(self) -> Mapping[str, float]:

@@ -2,27 +2,57 @@
 
 An entry is the folder `cache/<kind>/<key>` with its payload and `manifest.json` (identity and checksums).
 It is built in `<key>.partial`, which survives a kill so that a training can go on from its checkpoint,
-and renamed when it is whole. A damaged entry is set aside as `<key>.damaged-N` and built again.
+and renamed when it is whole. A damaged or misplaced entry is set aside as `<key>.damaged-N` and built again.
 """
 
 from __future__ import annotations
 
 import logging
 import platform
-import shutil
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+import re
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from dadiff.errors import DataError, StoreError
-from dadiff.store.files import checksum, files_in, is_locked, locked, make_folder, read_json, sync_folder, write_json
+from dadiff.store.files import (
+    broken_seals,
+    files_in,
+    fresh_folder,
+    is_locked,
+    locked,
+    seal,
+    sync_folder,
+    write_json,
+)
+from dadiff.store.folder import store_id
+from dadiff.store.names import KEY, KIND, key_of, kind_of
+from dadiff.store.typed import read_typed
 
 MANIFEST = "manifest.json"
 PARTIAL, DAMAGED = ".partial", ".damaged-"
+FOLDER = re.compile(rf"{KEY.pattern}(\{PARTIAL}|\{DAMAGED}\d+)?")
 
 log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """`manifest.json` of an entry.
+
+    Args:
+        identity: everything that determines the content, for people.
+        files: name -> checksum and size; none while it is being built.
+    """
+
+    kind: str
+    key: str
+    files: Mapping[str, Mapping[str, Any]]
+    identity: Mapping[str, Any] = field(default_factory=dict)
+    created: str | None = None
+    host: str = ""
 
 
 @dataclass(frozen=True)
@@ -30,7 +60,8 @@ class Entry:
     """One folder of the cache as it lies on disk.
 
     Args:
-        state: "whole" (its checksums are not looked at here), "partial", "building" or "damaged".
+        state: "whole" (its checksums are not looked at here), "partial", "building", "damaged", or "foreign": without a
+            manifest of its kind and key.
         size: in bytes.
     """
 
@@ -50,11 +81,12 @@ class Cache:
 
     def folder(self, kind: str, key: str) -> Path:
         """Where an entry lies, whether it exists or not."""
-        return self.root / kind / key
+        return self.root / kind_of(kind) / key_of(key)
 
     def contains(self, kind: str, key: str) -> bool:
-        """Whether the entry was built; a look at the folder only, checksums are verified on reading."""
-        return (self.folder(kind, key) / MANIFEST).is_file()
+        """Whether the entry was built; a look at its manifest only, checksums are verified on reading."""
+        folder = self.folder(kind, key)
+        return (folder / MANIFEST).is_file() and not misplaced(folder, kind, key)
 
     def get_or_build(
         self,
@@ -77,6 +109,7 @@ class Cache:
         """
         folder = self.folder(kind, key)
         if not self._is_intact(folder):
+            store_id(self.root.parent)
             with locked(self._lock_file(kind, key), f"{kind} {key}"):
                 if not self._is_intact(folder):
                     _set_aside(folder)
@@ -89,13 +122,17 @@ class Cache:
         return is_locked(self._lock_file(kind, key))
 
     def entries(self) -> Iterator[Entry]:
-        """Every folder in the cache, whole or not."""
-        for folder in sorted(self.root.glob("[!.]*/[!.]*/")):
+        """Every folder in the cache that has the name of an entry, whole or not. Links are not followed."""
+        for folder in sorted(self.root.glob("*/*/")):
             kind, key = folder.parent.name, folder.name.split(".")[0]
-            size = sum(path.stat().st_size for path in files_in(folder))
-            yield Entry(kind, key, folder, self._state(folder, kind, key), size)
+            named = KIND.fullmatch(kind) and FOLDER.fullmatch(folder.name)
+            if named and not folder.is_symlink() and not folder.parent.is_symlink():
+                size = sum(path.stat().st_size for path in files_in(folder))
+                yield Entry(kind, key, folder, self._state(folder, kind, key), size)
 
     def _state(self, folder: Path, kind: str, key: str) -> str:
+        if misplaced(folder, kind, key):
+            return "foreign"
         if DAMAGED in folder.name:
             return "damaged"
         if folder.name.endswith(PARTIAL):
@@ -120,18 +157,25 @@ def damage(folder: Path) -> list[str]:
     Raises:
         StoreError: if a newer version wrote it.
     """
+    if wrong := misplaced(folder, folder.parent.name, folder.name.split(".")[0]):
+        return [wrong]
+    files = read_typed(folder / MANIFEST, Manifest).files
+    return broken_seals(folder, files) if files else [f"{MANIFEST} names no file"]
+
+
+def misplaced(folder: Path, kind: str, key: str) -> str | None:
+    """What is wrong with a folder's manifest as that of an entry; None if it says this kind and key.
+
+    Raises:
+        StoreError: if a newer version wrote it.
+    """
     try:
-        files = read_json(folder / MANIFEST)["files"]
+        found = read_typed(folder / MANIFEST, Manifest)
     except DataError as error:
-        return [str(error)]
-    problems = []
-    for name, expected in files.items():
-        path = folder / name
-        if not path.is_file():
-            problems.append(f"{name} is missing")
-        elif path.stat().st_size != expected["bytes"] or checksum(path) != expected["sha256"]:
-            problems.append(f"{name} differs from its checksum")
-    return problems
+        return str(error)
+    if (found.kind, found.key) == (kind, key):
+        return None
+    return f"{MANIFEST} is that of {found.kind} {found.key}, not of {kind} {key}"
 
 
 def _set_aside(folder: Path) -> None:
@@ -151,23 +195,14 @@ def _build(
     folder: Path, kind: str, key: str, identity: dict[str, Any], build: Callable[[Path], None], resumable: bool
 ) -> None:
     partial = folder.with_name(folder.name + PARTIAL)
-    if partial.exists() and not resumable:
-        shutil.rmtree(partial)
-    make_folder(partial)
+    manifest = {"kind": kind, "key": key, "identity": identity, "host": platform.node()}
+    if not resumable or partial.is_symlink() or misplaced(partial, kind, key):
+        write_json(fresh_folder(partial) / MANIFEST, {**manifest, "files": {}})  # whose it is, also if killed
     build(partial)
-    files = {str(p.relative_to(partial)): p for p in files_in(partial) if p.name != MANIFEST}
+    files = seal((path for path in files_in(partial) if path.name != MANIFEST), partial)
     if not files:
         raise StoreError(f"{folder}: building it wrote no file")
-    write_json(
-        partial / MANIFEST,
-        {
-            "kind": kind,
-            "key": key,
-            "identity": identity,
-            "created": datetime.now(UTC).isoformat(timespec="seconds"),
-            "host": platform.node(),
-            "files": {name: {"sha256": checksum(p), "bytes": p.stat().st_size} for name, p in files.items()},
-        },
-    )
+    created = datetime.now(UTC).isoformat(timespec="seconds")
+    write_json(partial / MANIFEST, {**manifest, "created": created, "files": files})
     sync_folder(partial)
     partial.rename(folder)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from dadiff.errors import DadiffError, StoreError
 from dadiff.store.cache import Cache, Entry, damage
+from dadiff.store.folder import is_store
 from dadiff.store.results import Results
 from dadiff.store.sweeps import Sweeps
 
@@ -40,22 +41,31 @@ def list_entries(output_dir: Path) -> list[str]:
 
 
 def verify(output_dir: Path) -> list[str]:
-    """One line a damaged entry; empty if every checksum holds."""
-    whole = (entry for entry in Cache(output_dir).entries() if entry.state == "whole")
-    damaged = ((entry, damage(entry.folder)) for entry in whole)
-    return [f"{entry.kind} {entry.key}: {'; '.join(problems)}" for entry, problems in damaged if problems]
+    """One line a damaged or misplaced entry or run; empty if every checksum holds."""
+    entries = (entry for entry in Cache(output_dir).entries() if entry.state in ("whole", "foreign"))
+    damaged = ((entry, damage(entry.folder)) for entry in entries)
+    lines = [f"{entry.kind} {entry.key}: {'; '.join(problems)}" for entry, problems in damaged if problems]
+    return lines + [f"run {key}: {'; '.join(problems)}" for key, problems in Results(output_dir).damaged()]
 
 
 def prune(output_dir: Path, *, dry_run: bool) -> list[str]:
     """Remove what no stored run was made with, what is damaged and what was left half built.
 
+    Only what carries a manifest of its kind and key is touched, and links are not followed.
+
     Raises:
-        StoreError: while something is being worked on, which may need what no stored run needs yet.
+        StoreError: where no store of ours is; while something is being worked on, which may need what no stored run
+            needs yet.
     """
+    if not is_store(output_dir):
+        raise StoreError(f"{output_dir}: is no output folder of dadiff (it has no store.json); nothing is removed")
     _check_quiet(output_dir)
     counts, lines = users(output_dir), []
     for entry in Cache(output_dir).entries():
         if entry.state == "whole" and counts[entry.kind, entry.key]:
+            continue
+        if entry.state == "foreign":
+            lines.append(f"left alone {_line(entry, 0)}: without a manifest of its kind and key")
             continue
         lines.append(f"{'would remove' if dry_run else 'removed'} {_line(entry, 0)}")
         if not dry_run:

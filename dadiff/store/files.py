@@ -7,7 +7,8 @@ import json
 import logging
 import math
 import os
-from collections.abc import Iterator
+import shutil
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,8 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from dadiff.errors import DataError, LockedError, StoreError
+from dadiff.outside import text_of
+from dadiff.store.names import is_inside
 
 FORMAT = 1
 """Version of everything that `dadiff.store` writes; readers refuse newer ones."""
@@ -53,6 +56,7 @@ def strict(value: Any) -> Any:
 def write_json(path: Path, value: dict[str, Any]) -> None:
     """Write strict JSON with the format's version on top, replacing an older file at once."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    temporary.unlink(missing_ok=True)  # where a link led, nothing is written
     temporary.write_text(json.dumps({"format": FORMAT, **strict(value)}, indent=1, allow_nan=False) + "\n")
     sync(temporary)
     temporary.replace(path)
@@ -65,21 +69,54 @@ def read_json(path: Path) -> dict[str, Any]:
         DataError: if the file is missing or damaged.
         StoreError: if it is of a newer format than this version reads.
     """
+    text = text_of(path)
     try:
-        value = json.loads(path.read_text())
+        value = json.loads(text)
         version = int(value["format"])
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read ({error.strerror})") from error
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise DataError(f"{path}: is damaged or not written by dadiff ({error}); remove it and run again") from error
     if version > FORMAT:
         raise StoreError(f"{path}: has format {version}, this version reads up to {FORMAT}; update dadiff")
     return value
 
 
+def fresh_folder(path: Path) -> Path:
+    """An empty folder in the place of whatever lies there. Of a link only the link goes.
+
+    Raises:
+        StoreError: if it cannot be made or written to.
+    """
+    if path.is_symlink() or path.is_file():
+        path.unlink()
+    shutil.rmtree(path, ignore_errors=True)
+    return make_folder(path)
+
+
 def files_in(folder: Path) -> list[Path]:
-    """All files below a folder, in a fixed order."""
-    return sorted(path for path in folder.rglob("*") if path.is_file())
+    """All files below a folder, in a fixed order, without links."""
+    return sorted(path for path in folder.rglob("*") if path.is_file() and not path.is_symlink())
+
+
+def seal(files: Iterable[Path], folder: Path) -> dict[str, dict[str, Any]]:
+    """What tells later whether files are what was written: relative path -> checksum and size."""
+    return {
+        path.relative_to(folder).as_posix(): {"sha256": checksum(path), "bytes": path.stat().st_size} for path in files
+    }
+
+
+def broken_seals(folder: Path, sealed: Mapping[str, Any]) -> list[str]:
+    """What is wrong with sealed files, one phrase a file; empty if they are what was written."""
+    return [problem for name, seal in sealed.items() if (problem := _broken(folder, name, seal))]
+
+
+def _broken(folder: Path, name: str, seal: Any) -> str | None:
+    path = folder / name
+    if not is_inside(name) or not isinstance(seal, Mapping):
+        return f"{name!r} is no file of this folder"
+    if not path.is_file() or path.is_symlink():
+        return f"{name} is missing"
+    differs = path.stat().st_size != seal.get("bytes") or checksum(path) != seal.get("sha256")
+    return f"{name} differs from its checksum" if differs else None
 
 
 def checksum(path: Path) -> str:

@@ -3,9 +3,21 @@
 from __future__ import annotations
 
 import uuid
+from dataclasses import dataclass
 from pathlib import Path
 
-from dadiff.store.files import locked, make_folder, read_json, write_json
+from dadiff.errors import DataError
+from dadiff.store.files import locked, make_folder, write_json
+from dadiff.store.typed import read_typed
+
+STORE = "store.json"
+
+
+@dataclass(frozen=True)
+class Store:
+    """`store.json`: what an output folder says of itself."""
+
+    id: str
 
 
 def store_id(output_dir: Path | str) -> str:
@@ -16,9 +28,17 @@ def store_id(output_dir: Path | str) -> str:
         DataError: if the file that holds the id is damaged.
     """
     root = make_folder(Path(output_dir).absolute())
-    path = root / "store.json"
+    path = root / STORE
     if not path.is_file():
         with locked(root / ".store.lock", f"the id of {root}"):
             if not path.is_file():
                 write_json(path, {"id": uuid.uuid4().hex})
-    return str(read_json(path)["id"])
+    return read_typed(path, Store).id
+
+
+def is_store(output_dir: Path | str) -> bool:
+    """Whether a folder is one that dadiff has written to."""
+    try:
+        return bool(read_typed(Path(output_dir).absolute() / STORE, Store).id)
+    except DataError:
+        return False

@@ -8,15 +8,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import Any, Literal, get_args
 
-from dadiff.errors import DataError
 from dadiff.store.files import read_json
-
-if TYPE_CHECKING:
-    from pydantic import TypeAdapter
+from dadiff.store.typed import typed
 
 Done = Literal["finished", "diverged", "infeasible", "refused"]
 Failure = Literal["failed", "killed", "timeout", "out_of_memory", "interrupted"]
@@ -61,6 +57,7 @@ class Record:
         notes: by topic, what is worth knowing beside the numbers.
         counts: of cases, samples and robots.
         links: kind -> key of what the run was made with.
+        files: name -> checksum and size of what lies beside the record; filled in by its writer.
     """
 
     key: str
@@ -74,6 +71,7 @@ class Record:
     notes: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     counts: Mapping[str, int] = field(default_factory=dict)
     links: Mapping[str, str] = field(default_factory=dict)
+    files: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     provenance: Provenance = field(default_factory=Provenance)
 
     @property
@@ -93,24 +91,8 @@ def read_record(path: Path) -> Record:
         DataError: if the file is missing or damaged, or a field is missing or of a wrong type.
         StoreError: if its format is newer than this version reads.
     """
-    from pydantic import ValidationError
-
     stored = read_json(path)
     metrics = stored.get("metrics")
     if isinstance(metrics, dict):
         stored["metrics"] = {name: math.nan if value is None else value for name, value in metrics.items()}
-    try:
-        return _adapter().validate_python(stored)
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(map(str, first["loc"]))
-        raise DataError(
-            f"{path}: {where}: {first['msg'][0].lower()}{first['msg'][1:]}; remove it and run again"
-        ) from error
-
-
-@cache
-def _adapter() -> TypeAdapter[Record]:
-    from pydantic import TypeAdapter
-
-    return TypeAdapter(Record)
+    return typed(stored, Record, path)

@@ -11,12 +11,26 @@ import logging
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dadiff.errors import LockedError, StoreError
-from dadiff.store.files import is_locked, locked, make_folder, sync_folder, write_json
+from dadiff.errors import DataError, LockedError, StoreError
+from dadiff.store.files import (
+    broken_seals,
+    checksum,
+    files_in,
+    fresh_folder,
+    is_locked,
+    locked,
+    make_folder,
+    seal,
+    sync_folder,
+    write_json,
+)
+from dadiff.store.folder import store_id
+from dadiff.store.names import key_of
 from dadiff.store.record import DONE, Record, Status, read_record
 
 if TYPE_CHECKING:
@@ -84,8 +98,31 @@ class StoredRun:
         path = self.folder / f"{name}.npz"
         if not path.is_file():
             return {}
+        _check_seal(path)
         with np.load(path, allow_pickle=False) as stored:
             return {key: stored[key] for key in stored.files}
+
+
+@lru_cache(maxsize=4096)
+def _seals(path: Path, changed: int) -> Mapping[str, Any]:
+    return read_record(path).files
+
+
+@lru_cache(maxsize=65536)
+def _is_whole(path: Path, changed: int, seal: tuple[int, str]) -> bool:
+    return (path.stat().st_size, checksum(path)) == seal
+
+
+def _check_seal(path: Path) -> None:
+    """Refuse a run's file that is not what was written; looked at once, and again when it changes.
+
+    Raises:
+        StoreError: if it differs from its checksum.
+    """
+    record = path.with_name(RECORD)
+    seal = _seals(record, record.stat().st_mtime_ns).get(path.name)
+    if seal and not _is_whole(path, path.stat().st_mtime_ns, (seal.get("bytes", -1), str(seal.get("sha256")))):
+        raise StoreError(f"{path}: differs from its checksum; run it again with force=true")
 
 
 def read_table(folder: Path, name: str) -> pd.DataFrame:
@@ -99,6 +136,7 @@ def read_table(folder: Path, name: str) -> pd.DataFrame:
     path = folder / f"{name}.parquet"
     if not path.is_file():
         raise StoreError(f"{path}: this run has no such table; see status and reason in its {RECORD}")
+    _check_seal(path)
     try:
         return pd.read_parquet(path)
     except (OSError, ValueError) as error:
@@ -113,11 +151,21 @@ class Results:
 
     def folder(self, key: str) -> Path:
         """Where a run lies, whether it exists or not."""
-        return self.root / key
+        return self.root / key_of(key)
 
     def status(self, key: str) -> Status | None:
-        """The status of a stored run; None if there is none."""
-        return self.read(key).status if (self.folder(key) / RECORD).is_file() else None
+        """The status of a stored run; None if there is none, or one that is damaged or another's.
+
+        Raises:
+            StoreError: if its format is newer than this version reads.
+        """
+        if not (self.folder(key) / RECORD).is_file():
+            return None
+        try:
+            return self.read(key).status
+        except DataError as error:
+            log.warning("%s; it counts as not done", error)
+            return None
 
     def is_done(self, key: str) -> bool:
         """Whether the run is finished, or ended in a way that is itself a result."""
@@ -127,15 +175,38 @@ class Results:
         """One stored run.
 
         Raises:
-            DataError: if there is none, or its record is damaged.
+            DataError: if there is none, or its record is damaged or that of another run.
             StoreError: if its format is newer than this version reads.
         """
-        return StoredRun(self.folder(key), read_record(self.folder(key) / RECORD))
+        path = self.folder(key) / RECORD
+        record = read_record(path)
+        if record.key != key:
+            raise DataError(
+                f"{path}: is the record of run {record.key[:80]}; was its folder renamed? give it back its name"
+            )
+        return StoredRun(path.parent, record)
 
     def __iter__(self) -> Iterator[StoredRun]:
-        """All stored runs, failed ones among them, in the order of their names."""
-        runs = [self.read(path.parent.name) for path in self.root.glob(f"[!.]*/{RECORD}")]
-        return iter(sorted(runs, key=lambda run: run.name))
+        """All stored runs, failed ones among them, in the order of their names; a line for each that is unreadable."""
+        keys = [path.parent.name for path in sorted(self.root.glob(f"[!.]*/{RECORD}"))]
+        return iter(sorted(filter(None, map(self._readable, keys)), key=lambda run: run.name))
+
+    def _readable(self, key: str) -> StoredRun | None:
+        try:
+            return self.read(key)
+        except (DataError, StoreError) as error:
+            log.warning("left out: %s", error)
+            return None
+
+    def damaged(self) -> Iterator[tuple[str, list[str]]]:
+        """The runs whose record cannot be read or whose files differ from their checksums, with what is wrong."""
+        for path in sorted(self.root.glob(f"[!.]*/{RECORD}")):
+            try:
+                problems = broken_seals(path.parent, self.read(path.parent.name).record.files)
+            except (DataError, StoreError) as error:
+                problems = [str(error)]
+            if problems:
+                yield path.parent.name, problems
 
     def working(self, key: str) -> AbstractContextManager[None]:
         """Claim the run while working on it; a second process that wants it waits, then finds it done."""
@@ -170,16 +241,15 @@ class Results:
         import numpy as np
 
         make_folder(self.root)
-        work = self.root / f".writing-{record.key}"
-        shutil.rmtree(work, ignore_errors=True)
-        make_folder(work)
+        store_id(self.root.parent)
+        work = fresh_folder(self.root / f".writing-{key_of(record.key)}")
         for name, table in (tables or {}).items():
             table.to_parquet(work / f"{name}.parquet", index=False)
         if arrays:
             np.savez(work / "examples.npz", **dict(arrays))  # type: ignore[arg-type]
         if config_text:
             (work / "config.yaml").write_text(config_text)
-        write_json(work / RECORD, record.to_json())
+        write_json(work / RECORD, replace(record, files=seal(files_in(work), work)).to_json())
         sync_folder(work)
         _replace(work, self.folder(record.key))
         return self.read(record.key)
@@ -194,13 +264,15 @@ class Results:
             log.info("run %s: failed here (%s), but another process works on it", record.key, record.reason)
 
     def _lock_file(self, key: str) -> Path:
-        return self.root / ".locks" / f"{key}.lock"
+        return self.root / ".locks" / f"{key_of(key)}.lock"
 
 
 def _replace(new: Path, folder: Path) -> None:
     old = folder.with_name(f".replaced-{folder.name}")
     shutil.rmtree(old, ignore_errors=True)
-    if folder.exists():
+    if folder.is_symlink():
+        folder.unlink()
+    elif folder.exists():
         folder.rename(old)
     new.rename(folder)
     shutil.rmtree(old, ignore_errors=True)

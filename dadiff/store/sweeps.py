@@ -15,7 +15,9 @@ from pathlib import Path
 from typing import Any
 
 from dadiff.errors import DataError, LockedError
-from dadiff.store.files import is_locked, locked, make_folder, read_json, write_json
+from dadiff.store.files import is_locked, locked, make_folder, write_json
+from dadiff.store.names import SWEEP, key_of, sweep_name
+from dadiff.store.typed import read_typed
 
 PATIENCE_SECONDS = 2.0  # for a lock that is only being looked at
 HOLDER = "launcher.json"
@@ -53,6 +55,15 @@ class Sweep:
 
 
 @dataclass(frozen=True)
+class Holder:
+    """The launcher that runs a sweep, as `launcher.json` says."""
+
+    token: str
+    host: str
+    pid: int
+
+
+@dataclass(frozen=True)
 class Lease:
     """The right to run a sweep, as its launcher has it until its process ends. Jobs on any machine can look at it.
 
@@ -67,7 +78,7 @@ class Lease:
     def is_held(self) -> bool:
         """Whether the launcher that took it still runs."""
         try:
-            return _is_run(self.folder) and read_json(self.folder / HOLDER)["token"] == self.token
+            return _is_run(self.folder) and read_typed(self.folder / HOLDER, Holder).token == self.token
         except DataError:
             return True
 
@@ -80,11 +91,12 @@ class Sweeps:
 
     def folder(self, name: str) -> Path:
         """Where a sweep's record and logs lie."""
-        return self.root / name
+        return self.root / sweep_name(name)
 
     def names(self) -> list[str]:
         """The names of all stored sweeps."""
-        return sorted(path.parent.name for path in self.root.glob("*/sweep.json"))
+        folders = [path.parent.name for path in self.root.glob("*/sweep.json")]
+        return sorted(name for name in folders if SWEEP.fullmatch(name))
 
     @contextmanager
     def running(self, name: str) -> Iterator[Lease]:
@@ -99,14 +111,14 @@ class Sweeps:
             try:
                 stack.enter_context(locked(_lock_file(folder), f"sweep {name}", PATIENCE_SECONDS))
             except LockedError as error:
-                holder = read_json(folder / HOLDER)
+                holder = read_typed(folder / HOLDER, Holder)
                 raise LockedError(
-                    f"sweep {name} is being run by process {holder['pid']} on {holder['host']}; "
+                    f"sweep {name} is being run by process {holder.pid} on {holder.host}; "
                     "wait until it ends, or give this one another name with hydra.launcher.sweep=..."
                 ) from error
-            lease = Lease(folder, uuid.uuid4().hex)
-            write_json(folder / HOLDER, {"token": lease.token, "host": platform.node(), "pid": os.getpid()})
-            yield lease
+            holder = Holder(uuid.uuid4().hex, platform.node(), os.getpid())
+            write_json(folder / HOLDER, asdict(holder))
+            yield Lease(folder, holder.token)
 
     def is_running(self, name: str) -> bool:
         """Whether a living process runs the sweep."""
@@ -125,9 +137,15 @@ class Sweeps:
             DataError: if there is none of this name, or its record is damaged.
             StoreError: if its format is newer than this version reads.
         """
-        stored = read_json(self.folder(name) / "sweep.json")
-        cells = [Cell(**cell) for cell in stored["cells"]]
-        return Sweep(stored["name"], stored["command"], stored["definition"], cells)
+        path = self.folder(name) / "sweep.json"
+        sweep = read_typed(path, Sweep)
+        if sweep.name != name:
+            raise DataError(
+                f"{path}: is the record of sweep {sweep.name[:80]!r}; was its folder renamed? give it back its name"
+            )
+        for cell in sweep.cells:
+            key_of(cell.key)
+        return sweep
 
 
 def _lock_file(folder: Path) -> Path:
