@@ -15,7 +15,7 @@ from dadiff.config import build
 from dadiff.config.build import resolve
 from dadiff.config.composed import plain
 from dadiff.launching import register
-from dadiff.systems import AffineSystem, GaussianExcitation, Linear, TimeVarying, double_integrator
+from dadiff.systems import AffineSystem, Family, GaussianExcitation, Linear, System, TimeVarying, double_integrator
 
 CONF = Path(__file__).parent.parent / "conf"
 
@@ -117,6 +117,16 @@ def variants(group: str, options: dict[str, tuple[Any, ...]]) -> dict[str, Any]:
             if made not in found.values():
                 found[",".join([preset, *(f"{name}={value}" for name, value in change.items())])] = made
     return found
+
+
+OWN = {"A": [[0.9, 0.1], [-0.2, 0.8]], "B": [[0.0], [0.5]], "c": [0.1, -0.2], "bounds": {"input_high": 2}}
+"""What `system=inline` leaves for the user to say."""
+
+
+def shipped_system(preset: str) -> System:
+    """The system of a preset; of a family three robots."""
+    made = component("system", preset, **(OWN if preset == "inline" else {}))
+    return made.inside(3, np.random.default_rng(0)) if isinstance(made, Family) else made
 
 
 def trajectories(system: Linear, horizon: int, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:

@@ -17,6 +17,7 @@ from dadiff.config.build import TARGET, resolve
 GIVEN = {
     ("dataset", "npz"): ["dataset.path=somewhere"],
     ("dataset", "environments"): ["dataset.path=somewhere.yaml"],
+    ("system", "inline"): ["system.A=[[1,0.1],[0,1]]", "system.B=[[0],[0.1]]"],
     ("recording", "npz"): ["recording.path=somewhere"],
 }
 # Where a component stands for what its methods ask of it.

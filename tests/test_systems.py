@@ -2,22 +2,38 @@
 
 from __future__ import annotations
 
+import control
 import numpy as np
 import pytest
-from laws import AFFINE, fleet, members, tolerance, varying_system
+from laws import (
+    AFFINE,
+    OWN,
+    component,
+    composed,
+    fleet,
+    members,
+    presets,
+    shipped_system,
+    tolerance,
+    varying_system,
+)
 from scipy.linalg import expm
 
 from dadiff.behaviours import Transitions, least_squares
+from dadiff.config import build
 from dadiff.errors import ConfigError, ExcitationError, ShapeError
 from dadiff.systems import (
     Bounds,
     GaussianExcitation,
     Linear,
     Recording,
+    Robots,
     System,
     TimeVarying,
     double_integrator,
+    from_control,
 )
+from dadiff.systems.nonlinear import Simulated
 
 
 def test_A_and_B_are_the_papers():
@@ -102,6 +118,112 @@ def test_steps_linearisations_and_simulations_agree(system, rng):
         A, B, c = system.linearise(x[..., t, :], inputs[..., t, :], t)
         one = (A @ x[..., t, :, None] + B @ inputs[..., t, :, None])[..., 0] + c
         np.testing.assert_allclose(one, x[..., t + 1, :], atol=1e-12)
+
+
+@pytest.mark.parametrize("preset", presets("system"))
+class TestShippedSystems:
+    """Whatever lies in conf/system/: linearised as it steps, simulated as it steps, robots in one go as alone."""
+
+    def points(self, system: System, rng) -> tuple[np.ndarray, np.ndarray]:
+        lead = (*system.robots, 4)
+        return rng.standard_normal((*lead, system.state_dim)), rng.standard_normal((*lead, 5, system.input_dim))
+
+    def test_the_linearisation_is_the_derivative_of_the_step(self, preset, rng):
+        system = shipped_system(preset)
+        x, u = self.points(system, rng)
+        u, robots = u[..., 0, :], system.robots[0] if system.robots else None
+        difference = Simulated(system.step, system.state_dim, system.input_dim, num_robots=robots)
+        for found, expected in zip(system.linearise(x, u), difference.linearise(x, u), strict=True):
+            np.testing.assert_allclose(found, expected, atol=1e-7)
+
+    def test_simulating_is_stepping(self, preset, rng):
+        system = shipped_system(preset)
+        x, u = self.points(system, rng)
+        noise = rng.standard_normal((*u.shape[:-1], system.state_dim))
+        states = system.simulate(x, u, noise)
+        for t in range(u.shape[-2]):
+            np.testing.assert_allclose(states[..., t, :], x, rtol=1e-9, atol=1e-9)
+            x = system.step(x, u[..., t, :], t) + noise[..., t, :]
+
+    def test_the_layout_has_the_systems_sizes_and_names(self, preset, rng):
+        system = shipped_system(preset)
+        layout = system.layout(7)
+        assert (layout.state_dim, layout.input_dim, layout.horizon) == (system.state_dim, system.input_dim, 7)
+        assert layout.channel("x").labels == system.state_names
+        x, u = self.points(system, rng)
+        assert layout.size == 8 * x.shape[-1] + 7 * u.shape[-1]
+        assert system.time_step is None or system.time_step > 0
+
+    def test_a_fleet_is_its_robots(self, preset, rng):
+        system = shipped_system(preset)
+        x, u = self.points(system, rng)
+        if not isinstance(system, Robots):
+            pytest.skip("a single system")
+        for k in range(system.robots[0]):
+            one = system.take([k])
+            np.testing.assert_allclose(one.simulate(x[[k]], u[[k]]), system.simulate(x, u)[[k]], atol=1e-12)
+            assert one.bounds == system.bounds
+
+
+def test_a_system_of_ones_own_from_yaml():
+    words = [
+        "system.c=[0.5,0]",
+        "system.process_noise=[0.0,0.1]",
+        "system.bounds={input_high: 2}",
+        "system.time_step=0.1",
+    ]
+    config = composed("system=inline", "system.A=[[1,0.1],[0,1]]", "system.B=[[0],[0.1]]", *words)
+    system = build(config["system"], "system")
+    assert isinstance(system, Linear)
+    assert (system.A.tolist(), system.c.tolist(), system.time_step) == ([[1, 0.1], [0, 1]], [0.5, 0], 0.1)
+    assert system.bounds.of_inputs(1)[1].tolist() == [2]
+    assert config["recording"]["process_noise"] == [0.0, 0.1]
+    assert build(config["recording"], "recording").record(system).states.shape == (1, 101, 2)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"B": [[1.0]]}, r"system: A has shape \(2, 2\), B \(1, 1\) and c \(2,\)"),
+        ({"A": [[1.0, 0.0], [1.0]]}, "parts of A have shapes"),
+        ({"A": [[1.0, "a"], [1.0, 1.0]]}, "A is 'a'"),
+        ({"bounds": {"input_max": 1.0}}, "bounds.input_max is not known; expected input_low, input_high"),
+        ({"bounds": {"input_high": [1.0, 2.0]}}, r"input_high has shape \(2,\)"),
+        ({"state_names": ["p"]}, "1 labels for 2 entries"),
+    ],
+)
+def test_a_system_of_ones_own_that_does_not_fit_is_refused(changes, message):
+    with pytest.raises((ConfigError, ShapeError), match=message):
+        component("system", "inline", **{**OWN, **changes})
+
+
+def test_a_state_space_system_is_discretised():
+    A, B = [[0.0, 1.0], [-2.0, -0.3]], [[0.0], [1.0]]
+    ss = control.ss(A, B, np.eye(2), 0, states=["angle", "rate"], inputs=["torque"])
+    system = from_control(ss, 0.1, process_noise=0.01)
+    exact = expm(0.1 * np.block([[np.array(A), np.array(B)], [np.zeros((1, 3))]]))
+    np.testing.assert_allclose(np.hstack([system.A, system.B]), exact[:2], atol=1e-14)
+    assert (system.state_names, system.input_names) == (("angle", "rate"), ("torque",))
+    assert system.time_step == 0.1
+    again = from_control(control.c2d(ss, 0.1))
+    np.testing.assert_allclose(again.A, system.A, atol=1e-14)
+    assert again.time_step == 0.1
+    assert from_control(control.ss(A, B, np.eye(2), 0, True), 0.2).time_step == 0.2
+    assert from_control(control.ss(A, B, np.eye(2), 0), 0.2).state_names == ()
+
+
+@pytest.mark.parametrize(
+    ("dt", "time_step", "message"),
+    [
+        (0, None, "continuous and time_step is missing"),
+        (True, None, "discrete without a stated step and time_step is missing"),
+        (0.1, 0.2, r"dt = 0.1 s, time_step is 0.2; leave time_step out"),
+        (None, 0.2, "set its dt"),
+    ],
+)
+def test_a_state_space_system_of_another_step_is_refused(dt, time_step, message):
+    with pytest.raises(ConfigError, match=message):
+        from_control(control.ss(np.eye(2), np.ones((2, 1)), np.eye(2), 0, dt), time_step)
 
 
 @pytest.mark.parametrize(

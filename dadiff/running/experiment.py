@@ -27,6 +27,7 @@ from dadiff.running.provenance import record_of
 from dadiff.store import StoredRun
 from dadiff.systems import Robots, System
 from dadiff.tasks import Scores
+from dadiff.trajectory import TrajectoryLayout
 
 EXAMPLE_ROBOTS = 3
 
@@ -200,6 +201,7 @@ def examples(experiment: Experiment, plans: Plans) -> dict[str, np.ndarray]:
     states and rollout_states (cases, samples, T+1, n), inputs (cases, samples, T, m), reference_states (cases, T+1, n),
     reference_inputs (cases, T, m), and environment_* (cases, ...), the channels of E. Of a fleet all these have a
     first dimension of a few robots that differ most, `robots` (k,) says which ones, and their first case is the same.
+    Names and units of states and inputs lie beside them, see `_named`.
     """
     layout, cases, count = experiment.layout, experiment.cases, experiment.parts.evaluation.examples
     system, shown = _shown(experiment.target)
@@ -221,7 +223,15 @@ def examples(experiment: Experiment, plans: Plans) -> dict[str, np.ndarray]:
         "chain_states": layout.states(experiment.coordinates.to_physical(chain)),
         "noised_states": layout.states(noised),
         **({} if shown is Ellipsis else {"robots": shown}),
+        **_named(layout),
     }
+
+
+def _named(layout: TrajectoryLayout) -> dict[str, np.ndarray]:
+    """state_names, state_units (n,), input_names, input_units (m,), as far as the system has them."""
+    x, u = layout.channel("x"), layout.channel("u")
+    found = {"state_names": x.labels, "state_units": x.units, "input_names": u.labels, "input_units": u.units}
+    return {name: np.array(values) for name, values in found.items() if values}
 
 
 def _shown(target: System) -> tuple[System, Any]:

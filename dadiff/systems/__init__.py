@@ -1,6 +1,7 @@
 """Systems: linear dynamics, families of robots, and recordings of them."""
 
 from dadiff.systems.families import DampedIntegrators, Family, LaggedIntegrators, Robots, RotatedIntegrators
+from dadiff.systems.given import from_control, inline
 from dadiff.systems.integrators import double_integrator
 from dadiff.systems.linear import AffineSystem, Linear, TimeVarying, require_affine
 from dadiff.systems.recording import GaussianExcitation, Recording
@@ -20,5 +21,7 @@ __all__ = [
     "System",
     "TimeVarying",
     "double_integrator",
+    "from_control",
+    "inline",
     "require_affine",
 ]

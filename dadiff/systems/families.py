@@ -9,11 +9,13 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import ClassVar
 
 import numpy as np
 
 from dadiff.errors import ConfigError
 from dadiff.systems.linear import Linear
+from dadiff.systems.system import Bounds, Limits
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,8 +118,12 @@ class Ranges:
 class Family(ABC):
     """A dataclass of ranges and constants, with a yaml in `conf/system/`."""
 
+    state_names: ClassVar[tuple[str, ...]] = ()
+    input_names: ClassVar[tuple[str, ...]] = ()
+
     time_step: float
     process_noise: float | Sequence[float]
+    bounds: Limits | None
 
     def check(self) -> None:
         """Raise `ConfigError` on an empty range (in `Ranges`), a time step or a noise that makes no sense."""
@@ -146,6 +152,9 @@ class Family(ABC):
             robots=A.shape[:1],
             process_noise=self.process_noise,
             time_step=self.time_step,
+            bounds=Bounds.of(self.bounds),
+            state_names=self.state_names,
+            input_names=self.input_names,
             parameters=columns,
             distance=self.ranges.distance(values),
         )
@@ -176,12 +185,17 @@ class DampedIntegrators(Family):
         gain: range of b.
         time_step: h, in seconds.
         process_noise: standard deviation of w(t) per step, a number or one for each state.
+        bounds: any of input_low, input_high, state_low, state_high; a number, or one for each entry.
     """
+
+    state_names: ClassVar[tuple[str, ...]] = ("x", "y", "vx", "vy")
+    input_names: ClassVar[tuple[str, ...]] = ("ux", "uy")
 
     damping: Sequence[float] = (0.0, 3.0)
     gain: Sequence[float] = (0.4, 2.0)
     time_step: float = 0.1
     process_noise: float | Sequence[float] = 0.01
+    bounds: Limits | None = None
 
     def __post_init__(self) -> None:
         self.check()
@@ -210,13 +224,18 @@ class RotatedIntegrators(Family):
         angle: range of a, radians.
         time_step: h, in seconds.
         process_noise: standard deviation of w(t) per step, a number or one for each state.
+        bounds: any of input_low, input_high, state_low, state_high; a number, or one for each entry.
     """
+
+    state_names: ClassVar[tuple[str, ...]] = ("x", "y", "vx", "vy")
+    input_names: ClassVar[tuple[str, ...]] = ("ux", "uy")
 
     damping: Sequence[float] = (0.0, 3.0)
     gain: Sequence[float] = (0.4, 2.0)
     angle: Sequence[float] = (-1.0, 1.0)
     time_step: float = 0.1
     process_noise: float | Sequence[float] = 0.01
+    bounds: Limits | None = None
 
     def __post_init__(self) -> None:
         self.check()
@@ -246,13 +265,18 @@ class LaggedIntegrators(Family):
         lag: range of l, in seconds, positive.
         time_step: h, in seconds.
         process_noise: standard deviation of w(t) per step, a number or one for each state.
+        bounds: any of input_low, input_high, state_low, state_high; a number, or one for each entry.
     """
+
+    state_names: ClassVar[tuple[str, ...]] = ("x", "y", "vx", "vy", "fx", "fy")
+    input_names: ClassVar[tuple[str, ...]] = ("ux", "uy")
 
     damping: Sequence[float] = (0.0, 3.0)
     gain: Sequence[float] = (0.4, 2.0)
     lag: Sequence[float] = (0.05, 0.4)
     time_step: float = 0.1
     process_noise: float | Sequence[float] = 0.01
+    bounds: Limits | None = None
 
     def __post_init__(self) -> None:
         self.check()

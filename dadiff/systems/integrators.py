@@ -9,6 +9,7 @@ import numpy as np
 
 from dadiff.errors import ConfigError
 from dadiff.systems.linear import Linear
+from dadiff.systems.system import Bounds, Limits
 
 
 def discretise(
@@ -33,6 +34,7 @@ def double_integrator(
     time_step: float = 0.1,
     discretisation: Literal["euler", "zoh"] = "euler",
     process_noise: float | Sequence[float] = 0.01,
+    bounds: Limits | None = None,
 ) -> Linear:
     """Positions and velocities driven by accelerations: n = 2 axes, m = axes.
 
@@ -42,9 +44,22 @@ def double_integrator(
         axes: number of spatial axes.
         time_step: in seconds.
         process_noise: standard deviation of w(t) per step, a number or one for each state.
+        bounds: any of input_low, input_high, state_low, state_high; a number, or one for each entry.
     """
     if axes < 1:
         raise ConfigError(f"system: axes is {axes}; it must be at least 1")
     zero, one = np.zeros((axes, axes)), np.eye(axes)
     A, B = np.block([[zero, one], [zero, zero]]), np.vstack([zero, one])
-    return Linear(*discretise(A, B, time_step, discretisation), process_noise=process_noise, time_step=time_step)
+    A, B = discretise(A, B, time_step, discretisation)
+    names = "xyz" if axes <= 3 else ()
+    return Linear(
+        A,
+        B,
+        process_noise=process_noise,
+        time_step=time_step,
+        bounds=Bounds.of(bounds),
+        state_names=(*names[:axes], *(f"v{name}" for name in names[:axes])),
+        input_names=tuple(f"a{name}" for name in names[:axes]),
+        state_units=("m",) * axes + ("m/s",) * axes,
+        input_units=("m/s²",) * axes,
+    )

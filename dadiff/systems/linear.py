@@ -35,8 +35,8 @@ class AffineSystem(System):
     robots: tuple[int, ...] = field(default=(), kw_only=True)
 
     def __post_init__(self) -> None:
-        A, B = _stacked(self.A, "A"), _stacked(self.B, "B")
-        c = np.zeros(A.shape[:-1]) if self.c is None else _stacked(self.c, "c")
+        A, B = stacked(self.A, "A"), stacked(self.B, "B")
+        c = np.zeros(A.shape[:-1]) if self.c is None else stacked(self.c, "c")
         robots = () if self.robots is None else tuple(np.atleast_1d(np.asarray(self.robots, dtype=int)).tolist())
         for name, value in (("A", A), ("B", B), ("c", c), ("robots", robots)):
             object.__setattr__(self, name, value)
@@ -214,7 +214,7 @@ def require_affine(system: object, what: str) -> AffineSystem:
     return system
 
 
-def _stacked(matrices: object, name: str) -> np.ndarray:
+def stacked(matrices: object, name: str) -> np.ndarray:
     """One array from a matrix, an array of them, or a list of rows, or of one matrix a robot or a step."""
     shapes = {np.shape(M) for M in matrices} if isinstance(matrices, list | tuple) else set()
     if len(shapes) > 1:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -55,22 +56,22 @@ class GaussianExcitation:
     Args:
         length: S, the number of inputs.
         input_std: in the units of the input.
-        process_noise: standard deviation of w(t); None takes the system's.
+        process_noise: standard deviation of w(t), a number or one for each state; None takes the system's.
         count: how many experiments, side by side.
         seed: of the inputs and the noise.
     """
 
     length: int = 100
     input_std: float = 1.0
-    process_noise: float | None = None
+    process_noise: float | Sequence[float] | None = None
     count: int = 1
     seed: int = 0
 
     def __post_init__(self) -> None:
         if self.length < 1 or self.count < 1:
             raise ConfigError(f"recording: length is {self.length} and count {self.count}; both must be at least 1")
-        for name in ("input_std", "process_noise"):
-            if (std := getattr(self, name)) is not None and not 0 <= std < np.inf:
+        for name, std in (("input_std", self.input_std), ("process_noise", self.process_noise)):
+            if std is not None and not (np.isfinite(std).all() and (np.asarray(std) >= 0).all()):
                 raise ConfigError(f"recording: {name} is {std}; a standard deviation is finite and not negative")
 
     def record(self, system: System) -> Recording:
@@ -79,6 +80,8 @@ class GaussianExcitation:
         shape = (*system.robots, self.count, self.length)
         inputs = self.input_std * rng.standard_normal((*shape, system.input_dim))
         std = system.process_noise if self.process_noise is None else self.process_noise
-        noise = std * rng.standard_normal((*shape, system.state_dim))
+        if np.shape(std) not in ((), (system.state_dim,)):
+            raise ShapeError(f"recording: process_noise is {std}; expected a number or {system.state_dim} of them")
+        noise = np.asarray(std) * rng.standard_normal((*shape, system.state_dim))
         x_init = np.zeros((*system.robots, self.count, system.state_dim))
         return Recording(system.simulate(x_init, inputs, noise), inputs)

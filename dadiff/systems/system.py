@@ -9,8 +9,8 @@ dimension comes first: arrays are (*robots, ..., n) with `robots` = () or (R,). 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 
@@ -18,6 +18,8 @@ from dadiff.errors import ConfigError, ShapeError
 from dadiff.trajectory.layout import TrajectoryLayout
 
 Times = int | np.ndarray
+Limits = Mapping[str, float | Sequence[float]]
+"""Bounds as they stand in yaml: any of input_low, input_high, state_low, state_high."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +56,19 @@ class Bounds:
     def of_states(self, state_dim: int) -> tuple[np.ndarray, np.ndarray]:
         """(low, high), each (n,)."""
         return _spread(self.state_low, state_dim, "state_low"), _spread(self.state_high, state_dim, "state_high")
+
+    @classmethod
+    def of(cls, limits: Limits | None) -> Bounds:
+        """From a mapping with any of the four; None bounds nothing.
+
+        Raises:
+            ConfigError: on a name that is none of the four.
+        """
+        known = [field.name for field in fields(cls)]
+        for name in limits or {}:
+            if name not in known:
+                raise ConfigError(f"system: bounds.{name} is not known; expected {', '.join(known)}")
+        return cls(**{name: np.asarray(value, dtype=np.float64) for name, value in (limits or {}).items()})
 
     @property
     def any(self) -> bool:
