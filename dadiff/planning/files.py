@@ -1,0 +1,121 @@
+"""Planners in files: a zip of `planner.json` (what it is made of) and `arrays.safetensors` (its numbers).
+
+The file holds the weights, the robot's set and coordinates, and needs neither demonstrations nor the folder that it was
+trained in. Loading it executes nothing: see `dadiff.planning.codec`. Entries are stored, not compressed, so that no
+file unpacks to more than its size.
+"""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors import SafetensorError
+from safetensors.numpy import load as read_arrays
+from safetensors.numpy import save as write_arrays
+
+from dadiff import __version__
+from dadiff.denoisers.checkpoints import fill
+from dadiff.errors import CheckpointError
+from dadiff.planning.codec import Decoder, Encoder
+from dadiff.planning.planner import Planner
+
+FORMAT = 1
+DESCRIPTION, ARRAYS = "planner.json", "arrays.safetensors"
+WEIGHTS = "weights."
+RUNTIME = ("denoiser", "device")  # fields of a planner that are stored by other means, or not
+
+
+def save(planner: Planner, path: Path) -> Path:
+    """Write a planner whole, by renaming it into place.
+
+    Raises:
+        CheckpointError: if a part of it cannot be stored, or the place cannot be written to.
+    """
+    description, arrays = described(planner)
+    arrays |= {WEIGHTS + name: tensor.detach().cpu().numpy() for name, tensor in planner.denoiser.state_dict().items()}
+    partial = path.with_name(f".{path.name}.partial")
+    try:
+        with zipfile.ZipFile(partial, "w", zipfile.ZIP_STORED) as file:
+            file.writestr(DESCRIPTION, json.dumps(description))
+            file.writestr(ARRAYS, write_arrays(arrays))
+        partial.replace(path)
+    except OSError as error:
+        raise CheckpointError(f"{path}: cannot be written ({error.strerror}); name another place") from error
+    return path
+
+
+def described(planner: Planner) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """What a planner is made of, as plain data and arrays, without its weights."""
+    encode = Encoder()
+    parts = {f.name: getattr(planner, f.name) for f in fields(planner) if f.name not in RUNTIME}
+    plain = {name: encode(value, name) for name, value in parts.items()}
+    plain["denoiser"] = encode(planner.denoiser.made_from, "denoiser")
+    return {"format": FORMAT, "dadiff": __version__, "planner": plain}, encode.arrays
+
+
+def load(path: Path, components: Sequence[str] = (), device: str = "cpu") -> Planner:
+    """The planner of a file.
+
+    Raises:
+        CheckpointError: if the file is missing, foreign, damaged, too large, or of a newer version.
+    """
+    description, arrays = _opened(path)
+    return planner_of(description, arrays, str(path), components, device)
+
+
+def planner_of(
+    description: Mapping[str, Any], arrays: Mapping[str, np.ndarray], where: str, components: Sequence[str], device: str
+) -> Planner:
+    """The planner that is described, with the weights among the arrays."""
+    _check_format(description, where)
+    decode = Decoder(arrays, where, components)
+    parts = {name: decode(plain) for name, plain in description["planner"].items()}
+    try:
+        denoiser = parts.pop("denoiser").build(device)
+        planner = Planner(denoiser=denoiser, device=device, **parts)
+    except (KeyError, TypeError, AttributeError) as error:
+        raise CheckpointError(f"{where}: lacks a part of a planner ({error}); save it again") from error
+    weights = {name.removeprefix(WEIGHTS): torch.from_numpy(a) for name, a in arrays.items() if name.startswith(WEIGHTS)}
+    fill(denoiser.state_dict(), weights, Path(where))
+    return planner
+
+
+def _check_format(description: Mapping[str, Any], where: str) -> None:
+    found = description.get("format")
+    if not isinstance(found, int) or not isinstance(description.get("planner"), dict):
+        raise CheckpointError(f"{where}: is no planner of dadiff; write one with planner.save(...)")
+    if found > FORMAT:
+        raise CheckpointError(
+            f"{where}: has format {found}, this version reads up to {FORMAT}; update dadiff ({__version__} is here, "
+            f"{description.get('dadiff', 'unknown')} wrote it)"
+        )
+
+
+def _opened(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    if not path.is_file():
+        raise CheckpointError(f"{path}: no such file; give a file that planner.save(...) wrote, or a run's folder")
+    try:
+        with zipfile.ZipFile(path) as file:
+            _check_entries(file, path)
+            return json.loads(file.read(DESCRIPTION)), read_arrays(file.read(ARRAYS))
+    except (zipfile.BadZipFile, json.JSONDecodeError, UnicodeDecodeError, SafetensorError, KeyError, OSError) as error:
+        raise CheckpointError(f"{path}: is no planner of dadiff, or damaged ({error})") from error
+
+
+def _check_entries(file: zipfile.ZipFile, path: Path) -> None:
+    names = {entry.filename for entry in file.infolist()}
+    if names != {DESCRIPTION, ARRAYS}:
+        raise CheckpointError(f"{path}: holds {', '.join(sorted(names))[:80]}; expected {DESCRIPTION} and {ARRAYS}")
+    if any(entry.compress_type != zipfile.ZIP_STORED for entry in file.infolist()):
+        raise CheckpointError(f"{path}: is compressed, which a planner's file never is; save it again")
+    if sum(entry.file_size for entry in file.infolist()) > path.stat().st_size:
+        raise CheckpointError(f"{path}: declares more bytes than it has; it is damaged")
+
+

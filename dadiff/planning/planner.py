@@ -1,0 +1,190 @@
+"""`Planner`: a denoiser, a sampler, and the set of what the robot can do, as one thing that plans.
+
+    planner = Planner.load("robot.zip")
+    plan = planner.plan(x_init=[0, 0, 0, 0], target=[1, 2, 0, 0], samples=4, seed=0)
+
+It knows no store, no stop-watch and no configuration.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from dadiff.behaviours import Pin, Projection, TrajectorySet
+from dadiff.diffusion.chain import Denoise, Observe, Samples, sample
+from dadiff.diffusion.enforcement import Enforcement
+from dadiff.diffusion.samplers import Sampler
+from dadiff.diffusion.schedule import Schedule
+from dadiff.errors import NotApplicableError, ShapeError
+from dadiff.planning.plans import Plans
+from dadiff.randomness import torch_generator
+from dadiff.systems import System
+from dadiff.tasks import Task
+from dadiff.trajectory.coordinates import Coordinates
+from dadiff.trajectory.layout import Layout, TrajectoryLayout
+
+if TYPE_CHECKING:
+    from dadiff.behaviours import Projector
+
+
+@dataclass(frozen=True)
+class Planner:
+    """Draws plans for a condition E.
+
+    Args:
+        task: says what E holds and how long a plan is.
+        system: the robot that is planned for, or several.
+        schedule, sampler, denoiser: of the diffusion.
+        coordinates: where it acts.
+        behaviour: what the robot can do; None for vanilla diffusion.
+        enforcement: how the set enters the chain.
+        starts_fixed: whether x(0) is pinned to x_init of E.
+        divergence_bound: a chain is stopped once a value exceeds it, in the sampler's coordinates.
+        device: where the chain runs.
+    """
+
+    task: Task
+    system: System
+    schedule: Schedule
+    sampler: Sampler
+    denoiser: Denoise = field(repr=False)
+    coordinates: Coordinates
+    behaviour: TrajectorySet | None = None
+    enforcement: Enforcement | None = None
+    starts_fixed: bool = False
+    divergence_bound: float = 1e6
+    device: str = "cpu"
+
+    @cached_property
+    def layout(self) -> TrajectoryLayout:
+        """Of the plans."""
+        return self.system.layout(self.task.horizon)
+
+    @cached_property
+    def condition(self) -> Layout:
+        """Of E."""
+        return self.task.condition(self.system)
+
+    def plan(
+        self,
+        environment: np.ndarray | None = None,
+        *,
+        samples: int = 1,
+        seed: int = 0,
+        start: Plans | None = None,
+        pins: Sequence[Pin] = (),
+        **fields: object,
+    ) -> Plans:
+        """Plans for one condition or many.
+
+        Args:
+            environment: E (*robots, *cases, c); or give the fields of E by name, such as x_init=[...], target=[...].
+            samples: plans for each E.
+            seed: of all noise; the same seed gives the same plans.
+            start: plans to begin from, of the shape of the result, instead of noise; see `sample`.
+            pins: further entries of tau that are held, with values (*robots, *cases * samples, k).
+
+        Raises:
+            DataError: if a field of E is missing, not known, or unusable.
+            ShapeError: if E has another shape.
+        """
+        E = self.task.environment(self.system, fields) if environment is None else np.asarray(environment, np.float64)
+        lead, E = self._flat(E, samples)
+        generator = torch_generator(seed, "sampling noise")
+        begin = None if start is None else start.tau.reshape(*E.shape[:-1], self.layout.size)
+        drawn = self.draw(E, generator, self.projection(E, pins), start=begin)
+        tau = self.coordinates.to_physical(drawn.tau.cpu().numpy())
+        return Plans(
+            self.layout,
+            tau.reshape(*lead, samples, self.layout.size),
+            drawn.network_calls,
+            drawn.diverged_at,
+            drawn.unconverged,
+            self.system.time_step,
+        )
+
+    def _flat(self, E: np.ndarray, samples: int) -> tuple[tuple[int, ...], np.ndarray]:
+        """The leading dimensions of E, and E once for each plan, (*robots, plans, c)."""
+        robots = self.system.robots
+        if E.shape[-1:] != (self.condition.size,):
+            raise ShapeError(
+                f"plan: the condition has shape {E.shape}; its last dimension must be {self.condition.size}: "
+                f"{', '.join(self.condition.names)}"
+            )
+        if E.shape[: len(robots)] != robots:
+            E = np.broadcast_to(E, (*robots, *E.shape))
+        return E.shape[:-1], np.repeat(E.reshape(*robots, -1, E.shape[-1]), samples, axis=-2)
+
+    def projection(self, E: np.ndarray, pins: Sequence[Pin] = ()) -> Projection | None:
+        """The projection onto the set, bound to the plans' conditions (*robots, plans, c); None for vanilla diffusion.
+
+        Raises:
+            NotApplicableError: if the enforcement has no meaning for an affine set, and the set is one.
+        """
+        if self.behaviour is None or self.enforcement is None:
+            return None
+        start = (Pin.initial_state(self.layout, self.condition.get(E, "x_init")),) if self.starts_fixed else ()
+        projection = self.behaviour.bind(self.coordinates, (*start, *pins), self.device)
+        if not self.enforcement.affine and projection.affine:
+            raise NotApplicableError(
+                "enforcement: literal scales the sample, which is meaningless for an affine set (x(0) held, or "
+                "coordinates with a mean); use projector.initial_state=free and coordinates=physical, or another "
+                "enforcement"
+            )
+        return projection
+
+    def draw(
+        self,
+        E: np.ndarray,
+        generator: torch.Generator,
+        project: Callable[[Any], Any] | None,
+        observe: Observe | None = None,
+        start: np.ndarray | None = None,
+        *,
+        progress: bool = False,
+    ) -> Samples:
+        """The chain for conditions (*robots, plans, c), in the sampler's coordinates; see `dadiff.diffusion.chain`."""
+        return sample(
+            self.sampler,
+            self.schedule,
+            self.denoiser,
+            torch.as_tensor(E, device=self.device),
+            (*E.shape[:-1], self.layout.size),
+            generator,
+            project,
+            self.enforcement,
+            observe,
+            self.divergence_bound,
+            progress,
+        )
+
+    def of(self, system: System, projector: Projector) -> Planner:
+        """The same network for another robot: what it draws becomes a plan of this system through its own set."""
+        return replace(self, system=system, behaviour=projector.fit(system.layout(self.task.horizon), system=system))
+
+    def save(self, path: str | Path) -> Path:
+        """Write one self-contained file, see `dadiff.planning.files`."""
+        from dadiff.planning.files import save
+
+        return save(self, Path(path))
+
+    @classmethod
+    def load(cls, path: str | Path, components: Sequence[str] = (), device: str = "cpu") -> Planner:
+        """The planner of a file that `save` wrote, or of a run's folder.
+
+        Args:
+            components: packages besides dadiff whose classes the file may name.
+
+        Raises:
+            CheckpointError: if the file is foreign, damaged, or of a newer version.
+        """
+        from dadiff.planning.files import load
+
+        return load(Path(path), components, device)
