@@ -82,7 +82,9 @@ def planner_of(
         planner = Planner(denoiser=denoiser, device=device, **parts)
     except (KeyError, TypeError, AttributeError) as error:
         raise CheckpointError(f"{where}: lacks a part of a planner ({error}); save it again") from error
-    weights = {name.removeprefix(WEIGHTS): torch.from_numpy(a) for name, a in arrays.items() if name.startswith(WEIGHTS)}
+    weights = {
+        name.removeprefix(WEIGHTS): torch.from_numpy(a) for name, a in arrays.items() if name.startswith(WEIGHTS)
+    }
     fill(denoiser.state_dict(), weights, Path(where))
     return planner
 
@@ -117,5 +119,3 @@ def _check_entries(file: zipfile.ZipFile, path: Path) -> None:
         raise CheckpointError(f"{path}: is compressed, which a planner's file never is; save it again")
     if sum(entry.file_size for entry in file.infolist()) > path.stat().st_size:
         raise CheckpointError(f"{path}: declares more bytes than it has; it is damaged")
-
-

@@ -62,11 +62,11 @@ class Plans:
         if self.time_step is not None:
             columns["seconds"] = t * self.time_step
         for name, values in (("x", states), ("u", inputs)):
-            columns |= {c: values[..., k].ravel() for k, c in enumerate(self._columns(name))}
+            columns |= {c: values[..., k].ravel() for k, c in enumerate(self.columns(name))}
         return pd.DataFrame(columns)
 
-    def _columns(self, name: str) -> list[str]:
-        """`px (m)`, or `x0` where nothing is named."""
+    def columns(self, name: str) -> list[str]:
+        """How the entries of a channel are called: `px (m)`, or `x0` where nothing is named."""
         channel = self.layout.channel(name)
         labels = channel.labels or tuple(f"{name}{k}" for k in range(channel.dim))
         units = channel.units or ("",) * channel.dim
