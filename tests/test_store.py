@@ -132,7 +132,7 @@ def test_a_run_comes_back_as_it_was_stored(tmp_path):
     results = Results(tmp_path)
     results.write(
         record(metrics={"gap": np.float64(math.nan), "rank": np.int64(64)}),
-        config_text="a: 1\n",
+        files={"config.yaml": b"a: 1\n"},
         tables={"per_step": table},
         arrays={"states": np.ones((2, 3))},
     )

@@ -48,7 +48,7 @@ def store(root: Path, key: str = KEY):
         links={"dataset": KEY},
         provenance=Provenance(started="2024-01-01T00:00:00+00:00", seconds=2.0, versions={"dadiff": "0"}),
     )
-    return Results(root).write(record, config_text="seed: 1\n", tables={"per_step": table})
+    return Results(root).write(record, files={"config.yaml": b"seed: 1\n"}, tables={"per_step": table})
 
 
 def runs(tracking, condition=""):

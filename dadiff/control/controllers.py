@@ -16,7 +16,7 @@ from typing import Protocol
 import numpy as np
 
 from dadiff.errors import ConfigError, ShapeError
-from dadiff.systems import System
+from dadiff.systems.system import System
 from dadiff.trajectory.response import along
 
 Trajectories = tuple[np.ndarray, np.ndarray]

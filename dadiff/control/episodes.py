@@ -8,7 +8,7 @@ import numpy as np
 
 from dadiff.control.controllers import Controller
 from dadiff.errors import ShapeError
-from dadiff.systems import System
+from dadiff.systems.system import System
 
 
 @dataclass(frozen=True)

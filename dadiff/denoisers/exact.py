@@ -5,6 +5,7 @@ It separates what projecting does from what a network gets wrong, and makes samp
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Protocol, cast
 
 import numpy as np
@@ -48,6 +49,7 @@ class ExactDenoiser:
     """
 
     def __init__(self, law: Law, coordinates: Coordinates, schedule: Schedule, device: str = "cpu") -> None:
+        self.made_from = ExactParts(law, coordinates, schedule)
         self.alpha_bar = schedule.alpha_bar
         scale = coordinates.scale[:, None]
         U, s, _ = np.linalg.svd(law.noise_map / scale, full_matrices=False)
@@ -56,6 +58,10 @@ class ExactDenoiser:
         self.basis = torch.tensor(U, device=device)
         self._mean_map = torch.tensor(law.mean_map / scale, device=device)
         self._offset = torch.tensor((coordinates.mean - law.offset) / coordinates.scale, device=device)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Nothing: it has no weights."""
+        return {}
 
     def mean(self, environment: Tensor) -> Tensor:
         """mu (*robots, ..., d), the scaled mean given E (*robots, ..., c)."""
@@ -78,6 +84,19 @@ class ExactDenoiser:
         """sqrt(a) variance / (a variance + 1 - a), and 0 where variance is 0, (*robots, r)."""
         gain = np.sqrt(a) * self.variance / (a * self.variance + (1 - a))
         return torch.as_tensor(gain, device=self.basis.device)
+
+
+@dataclass(frozen=True)
+class ExactParts:
+    """What an exact denoiser is made from."""
+
+    law: Law
+    coordinates: Coordinates
+    schedule: Schedule
+
+    def build(self, device: str) -> ExactDenoiser:
+        """The denoiser."""
+        return ExactDenoiser(self.law, self.coordinates, self.schedule, device)
 
 
 def _along(M: Tensor, vectors: Tensor) -> Tensor:

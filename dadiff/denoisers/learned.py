@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from contextlib import AbstractContextManager
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -51,6 +52,7 @@ class NetworkDenoiser(nn.Module):
         super().__init__()
         table = prediction(recipe.prediction, schedule)
         self.layout, self.condition = layout, condition
+        self.made_from = NetworkParts(recipe, layout, condition, schedule)
         self.description = describe(recipe, layout, condition, schedule)
         self.estimate_tau, self.estimate_output = table.estimate_tau, table.estimate_output
         self.network = network.to_empty(device="cpu")
@@ -96,6 +98,21 @@ class NetworkDenoiser(nn.Module):
                 f"denoiser: the environment has {environment.shape[-1]} entries; the network was built for "
                 f"{self.condition.size}; use the task that it was trained on"
             )
+
+
+@dataclass(frozen=True)
+class NetworkParts:
+    """What a network denoiser is built from; see `Recipe.build`."""
+
+    recipe: Recipe
+    layout: TrajectoryLayout
+    condition: Layout
+    schedule: Schedule
+
+    def build(self, device: str) -> NetworkDenoiser:
+        """The denoiser, before its weights are filled in."""
+        generator = torch.Generator()
+        return self.recipe.build(self.layout, self.condition, self.schedule, generator).to(device)
 
 
 def on_meta() -> AbstractContextManager[object]:

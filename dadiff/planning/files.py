@@ -1,13 +1,14 @@
 """Planners in files: a zip of `planner.json` (what it is made of) and `arrays.safetensors` (its numbers).
 
-The file holds the weights, the robot's set and coordinates, and needs neither demonstrations nor the folder that it was
-trained in. Loading it executes nothing: see `dadiff.planning.codec`. Entries are stored, not compressed, so that no
+A run's folder holds the same two, without the weights, which lie in the store's cache. The zip holds the weights, the
+robot's set and coordinates, and needs neither demonstrations nor the folder that it was trained in. Loading it executes nothing: see `dadiff.planning.codec`. Entries are stored, not compressed, so that no
 file unpacks to more than its size.
 """
 
 from __future__ import annotations
 
 import json
+import re
 import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
@@ -25,9 +26,10 @@ from dadiff.denoisers.checkpoints import fill
 from dadiff.errors import CheckpointError
 from dadiff.planning.codec import Decoder, Encoder
 from dadiff.planning.planner import Planner
+from dadiff.store import Cache
 
 FORMAT = 1
-DESCRIPTION, ARRAYS = "planner.json", "arrays.safetensors"
+DESCRIPTION, ARRAYS, MODEL = "planner.json", "arrays.safetensors", "model.safetensors"
 WEIGHTS = "weights."
 RUNTIME = ("denoiser", "device")  # fields of a planner that are stored by other means, or not
 
@@ -60,13 +62,23 @@ def described(planner: Planner) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     return {"format": FORMAT, "dadiff": __version__, "planner": plain}, encode.arrays
 
 
+def in_folder(planner: Planner, weights: str | None) -> dict[str, bytes]:
+    """The files, by name, from which a run's folder is loaded as a planner.
+
+    Args:
+        weights: the key of the trained denoiser in the cache; None where nothing is trained.
+    """
+    description, arrays = described(planner)
+    return {DESCRIPTION: json.dumps({**description, "weights": weights}).encode(), ARRAYS: write_arrays(arrays)}
+
+
 def load(path: Path, components: Sequence[str] = (), device: str = "cpu") -> Planner:
-    """The planner of a file.
+    """The planner of a file, or of a run's folder `runs/<key>`.
 
     Raises:
         CheckpointError: if the file is missing, foreign, damaged, too large, or of a newer version.
     """
-    description, arrays = _opened(path)
+    description, arrays = _folder(path) if path.is_dir() else _opened(path)
     return planner_of(description, arrays, str(path), components, device)
 
 
@@ -98,6 +110,33 @@ def _check_format(description: Mapping[str, Any], where: str) -> None:
             f"{where}: has format {found}, this version reads up to {FORMAT}; update dadiff ({__version__} is here, "
             f"{description.get('dadiff', 'unknown')} wrote it)"
         )
+
+
+def _folder(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """What a run's folder holds, and the weights from the cache beside it."""
+    if not (path / DESCRIPTION).is_file():
+        raise CheckpointError(
+            f"{path}: holds no {DESCRIPTION}; it is no run of a plan that can be loaded, or an old one"
+        )
+    try:
+        description = json.loads((path / DESCRIPTION).read_bytes())
+        arrays = read_arrays((path / ARRAYS).read_bytes())
+        if (key := description.get("weights")) is None:
+            return description, arrays
+        return description, arrays | {WEIGHTS + name: a for name, a in _model(path, key).items()}
+    except (json.JSONDecodeError, UnicodeDecodeError, SafetensorError, AttributeError, OSError) as error:
+        raise CheckpointError(
+            f"{path}: the planner in it is damaged ({error}); run it again with force=true"
+        ) from error
+
+
+def _model(path: Path, key: object) -> dict[str, np.ndarray]:
+    if not (isinstance(key, str) and re.fullmatch("[0-9a-f]{16}", key)):
+        raise CheckpointError(f"{path}: names the weights {str(key)[:40]!r}, which is no key of a cache")
+    file = Cache(path.absolute().parent.parent).folder("denoiser", key) / MODEL
+    if not file.is_file():
+        raise CheckpointError(f"{path}: its trained denoiser {key} is no longer in the cache; run it again")
+    return read_arrays(file.read_bytes())
 
 
 def _opened(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:

@@ -12,26 +12,36 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import torch
 
 from dadiff.behaviours import Pin, Projection, TrajectorySet
-from dadiff.diffusion.chain import Denoise, Observe, Samples, sample
+from dadiff.diffusion.chain import Observe, Samples, sample
 from dadiff.diffusion.enforcement import Enforcement
 from dadiff.diffusion.samplers import Sampler
 from dadiff.diffusion.schedule import Schedule
 from dadiff.errors import NotApplicableError, ShapeError
 from dadiff.planning.plans import Plans
 from dadiff.randomness import torch_generator
-from dadiff.systems import System
+from dadiff.systems.system import System
 from dadiff.tasks import Task
 from dadiff.trajectory.coordinates import Coordinates
 from dadiff.trajectory.layout import Layout, TrajectoryLayout
 
 if TYPE_CHECKING:
     from dadiff.behaviours import Projector
+
+
+class Denoiser(Protocol):
+    """A denoiser that can be stored: trained, or exact."""
+
+    made_from: Any
+
+    def __call__(self, tau: torch.Tensor, i: int, environment: torch.Tensor) -> torch.Tensor: ...
+
+    def state_dict(self) -> dict[str, torch.Tensor]: ...
 
 
 @dataclass(frozen=True)
@@ -54,7 +64,7 @@ class Planner:
     system: System
     schedule: Schedule
     sampler: Sampler
-    denoiser: Denoise = field(repr=False)
+    denoiser: Denoiser = field(repr=False)
     coordinates: Coordinates
     behaviour: TrajectorySet | None = None
     enforcement: Enforcement | None = None
@@ -99,14 +109,15 @@ class Planner:
         lead, E = self._flat(E, samples)
         generator = torch_generator(seed, "sampling noise")
         begin = None if start is None else start.tau.reshape(*E.shape[:-1], self.layout.size)
-        drawn = self.draw(E, generator, self.projection(E, pins), start=begin)
+        project = self.projection(E, pins)
+        drawn = self.draw(E, generator, project, start=begin)
         tau = self.coordinates.to_physical(drawn.tau.cpu().numpy())
         return Plans(
             self.layout,
             tau.reshape(*lead, samples, self.layout.size),
             drawn.network_calls,
             drawn.diverged_at,
-            drawn.unconverged,
+            0 if project is None else project.info.unconverged,
             self.system.time_step,
         )
 

@@ -8,10 +8,12 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from dadiff.behaviours import TrajectorySet
 from dadiff.datasets.cached import load_data, save_data
 from dadiff.denoisers.recipes import ExactRecipe, Recipe
 from dadiff.errors import ConfigError
 from dadiff.experts.lqr import GaussianLaw
+from dadiff.planning import Planner
 from dadiff.running.identity import Artefact, Identity, identity_of
 from dadiff.running.parts import Parts
 from dadiff.store import Cache, Results
@@ -119,6 +121,39 @@ class Experiment:
         if isinstance(recipe, ExactRecipe):
             return recipe.exact(self.law, self.coordinates, self.parts.schedule, self.device)
         return self._trained(recipe)
+
+    @cached_property
+    def behaviour(self) -> TrajectorySet | None:
+        """What the projector finds admissible; None for vanilla diffusion."""
+        return self.parts.projector.fit(self.layout, system=self.target, **self.sources)
+
+    @cached_property
+    def sources(self) -> dict[str, Any]:
+        """What the projector learns from, besides the system."""
+        needs, sources = self.parts.projector.needs, dict[str, Any]()
+        if "recording" in needs:
+            sources["recording"] = self.parts.recording.record(self.target)
+        if "demonstrations" in needs:
+            sources["demonstrations"] = self.demonstrations.trajectories
+        return sources
+
+    @cached_property
+    def planner(self) -> Planner:
+        """All of it as one thing that plans."""
+        behaviour = self.behaviour  # before the denoiser is trained, since it may refuse what it is given
+        return Planner(
+            self.parts.task,
+            self.target,
+            self.parts.schedule,
+            self.parts.sampler,
+            self.denoiser,
+            self.coordinates,
+            behaviour,
+            self.parts.enforcement,
+            getattr(self.parts.projector, "initial_state", "free") == "fixed",
+            self.parts.evaluation.divergence_bound,
+            self.device,
+        )
 
     def prepare(self) -> None:
         """Build what is shared with other runs."""

@@ -14,13 +14,12 @@ import numpy as np
 import torch
 import yaml
 
-from dadiff.behaviours import Known, Projection, compared, pins
-from dadiff.diffusion.chain import Samples, sample
-from dadiff.diffusion.enforcement import Enforcement
-from dadiff.errors import NotApplicableError
+from dadiff.behaviours import Known, compared, pins
+from dadiff.diffusion.chain import Samples
 from dadiff.evaluation import replay, tracking_errors
 from dadiff.evaluation.mahalanobis import MahalanobisDistance
 from dadiff.evaluation.records import ChainRecorder, Snapshots, headline, merged, tables
+from dadiff.planning.files import in_folder
 from dadiff.randomness import numpy_generator, torch_generator
 from dadiff.running.assembly import Experiment
 from dadiff.running.provenance import record_of
@@ -82,56 +81,16 @@ def execute(experiment: Experiment) -> StoredRun:
         return _store(experiment, plans, started)
 
 
-def projection_of(experiment: Experiment, x_init: np.ndarray) -> tuple[Projection | None, dict[str, float]]:
-    """The projection bound to coordinates and cases, and what is measured of it.
-
-    Args:
-        x_init: (*robots, plans, n).
-    """
-    projector, layout = experiment.parts.projector, experiment.layout
-    sources = _sources(experiment)
-    start = time.perf_counter()
-    fitted = projector.fit(layout, system=experiment.target, **sources)
-    if fitted is None:
-        return None, {}
-    held = pins(projector, layout, x_init)
-    projection = fitted.bind(experiment.coordinates, held, experiment.device)
-    measures = {"projector_setup_seconds": time.perf_counter() - start, **fitted.notes}
-    if sources:
-        measures |= compared(fitted, Known().fit(layout, experiment.target), held)
-    return projection, measures
-
-
-def _sources(experiment: Experiment) -> dict[str, Any]:
-    """What the projector learns from, besides the system."""
-    needs, sources = experiment.parts.projector.needs, dict[str, Any]()
-    if "recording" in needs:
-        sources["recording"] = experiment.parts.recording.record(experiment.target)
-    if "demonstrations" in needs:
-        sources["demonstrations"] = experiment.demonstrations.trajectories
-    return sources
-
-
 def draw_plans(experiment: Experiment) -> Plans:
     """Sample plans for every case, with the same noise whatever the projector."""
-    parts, cases = experiment.parts, experiment.cases
-    evaluation, schedule = parts.evaluation, parts.schedule
+    evaluation, cases = experiment.parts.evaluation, experiment.cases
     environment = np.repeat(cases.environment, evaluation.samples, axis=-2)
-    projection, measures = projection_of(experiment, np.repeat(cases.x_init, evaluation.samples, axis=-2))
-    _check_enforcement(parts.enforcement, projection)
-    device = experiment.device
-    project = Timed(projection, device) if projection else None
-    denoiser = experiment.denoiser  # after the projection, which may refuse what it is given
+    project, measures = measured_projection(experiment, environment)
     chain, snapshots = _observers(experiment, environment)
     watch = Timed(lambda *seen: [observe(*seen) for observe in (chain, snapshots) if observe])
-    shape = (*environment.shape[:-1], experiment.layout.size)
+    planner, generator = experiment.planner, torch_generator(evaluation.seed, "sampling noise")
     start = time.perf_counter()
-    samples = sample(
-        parts.sampler, schedule, denoiser, torch.as_tensor(environment, device=experiment.device), shape,
-        torch_generator(evaluation.seed, "sampling noise"), project, parts.enforcement,
-        watch,
-        evaluation.divergence_bound, parts.settings.progress,
-    )  # fmt: skip
+    samples = planner.draw(environment, generator, project, watch, progress=experiment.parts.settings.progress)
     elapsed = time.perf_counter() - start - watch.seconds
     measures |= {"sampling_seconds": elapsed, "network_calls": samples.network_calls}
     if project and project.calls:
@@ -140,12 +99,20 @@ def draw_plans(experiment: Experiment) -> Plans:
     return Plans(experiment.coordinates.to_physical(tau), samples, measures, chain, snapshots)
 
 
-def _check_enforcement(enforcement: Enforcement, projection: Projection | None) -> None:
-    if projection is not None and projection.affine and not enforcement.affine:
-        raise NotApplicableError(
-            "enforcement: literal scales the sample, which is meaningless for an affine set (x(0) held, or coordinates "
-            "with a mean); use projector.initial_state=free and coordinates=physical, or another enforcement"
-        )
+def measured_projection(experiment: Experiment, environment: np.ndarray) -> tuple[Timed | None, dict[str, float]]:
+    """The projection bound to coordinates and conditions E (*robots, plans, c), and what is measured of its set."""
+    start = time.perf_counter()
+    behaviour = experiment.behaviour
+    fitted = time.perf_counter() - start
+    bind = Timed(experiment.planner.projection)  # once the denoiser is there, which may have to be trained
+    projection = bind(environment)
+    if behaviour is None or projection is None:
+        return None, {}
+    measures = {"projector_setup_seconds": fitted + bind.seconds, **behaviour.notes}
+    if experiment.sources:
+        held = pins(experiment.parts.projector, experiment.layout, experiment.condition.get(environment, "x_init"))
+        measures |= compared(behaviour, Known().fit(experiment.layout, experiment.target), held)
+    return Timed(projection, experiment.device), measures
 
 
 def _observers(experiment: Experiment, environment: np.ndarray) -> tuple[ChainRecorder | None, Snapshots]:
@@ -181,8 +148,10 @@ def _store(experiment: Experiment, plans: Plans, started: float) -> StoredRun:
         notes={"cases": experiment.cases.notes, "schedule": experiment.parts.schedule.conditions()},
         counts=_counts(experiment),
     )
-    text = yaml.safe_dump(dict(experiment.config), sort_keys=False)
-    return experiment.results.write(record, config_text=text, tables=written, arrays=arrays)
+    files = {"config.yaml": yaml.safe_dump(dict(experiment.config), sort_keys=False).encode()}
+    if trained := experiment.identity.denoiser:
+        files |= in_folder(experiment.planner, trained.key)
+    return experiment.results.write(record, files=files, tables=written, arrays=arrays)
 
 
 def evaluate(experiment: Experiment, planned: np.ndarray) -> Scores:

@@ -224,14 +224,14 @@ class Results:
         self,
         record: Record,
         *,
-        config_text: str = "",
+        files: Mapping[str, bytes] | None = None,
         tables: Mapping[str, pd.DataFrame] | None = None,
         arrays: Mapping[str, np.ndarray] | None = None,
     ) -> StoredRun:
         """Store a run whole, in place of an older one with its key.
 
         Args:
-            config_text: the resolved configuration as yaml, for people.
+            files: name -> content, such as the resolved configuration as yaml, for people.
             tables: name -> table, each a parquet file.
             arrays: what goes into `examples.npz`.
 
@@ -247,8 +247,8 @@ class Results:
             table.to_parquet(work / f"{name}.parquet", index=False)
         if arrays:
             np.savez(work / "examples.npz", **dict(arrays))  # type: ignore[arg-type]
-        if config_text:
-            (work / "config.yaml").write_text(config_text)
+        for name, content in (files or {}).items():
+            (work / name).write_bytes(content)
         write_json(work / RECORD, replace(record, files=seal(files_in(work), work)).to_json())
         sync_folder(work)
         _replace(work, self.folder(record.key))
