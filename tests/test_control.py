@@ -1,4 +1,4 @@
-"""Controllers and episodes: open loop is replay, feedback is the optimum's, receding horizons plan where the robot is."""
+"""Controllers and episodes: open loop is replay, feedback is optimal, receding horizons plan where the robot is."""
 
 from __future__ import annotations
 

@@ -7,9 +7,10 @@ dadiff's rooms of subject, or of a package that the caller names, is ever made f
 from __future__ import annotations
 
 import importlib
+import inspect
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field, is_dataclass
 from typing import Any
 
 import numpy as np
@@ -58,7 +59,9 @@ class Encoder:
         )
 
     def _fields(self, value: Any, place: str) -> dict[str, Plain]:
-        return {f.name: self(getattr(value, f.name), f"{place}.{f.name}") for f in fields(value) if f.init}
+        """What its constructor takes."""
+        names = inspect.signature(type(value)).parameters
+        return {name: self(getattr(value, name), f"{place}.{name}") for name in names}
 
 
 @dataclass(frozen=True)

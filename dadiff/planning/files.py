@@ -1,8 +1,8 @@
 """Planners in files: a zip of `planner.json` (what it is made of) and `arrays.safetensors` (its numbers).
 
 A run's folder holds the same two, without the weights, which lie in the store's cache. The zip holds the weights, the
-robot's set and coordinates, and needs neither demonstrations nor the folder that it was trained in. Loading it executes nothing: see `dadiff.planning.codec`. Entries are stored, not compressed, so that no
-file unpacks to more than its size.
+robot's set and coordinates, and needs neither demonstrations nor the folder that it was trained in. Loading it executes
+nothing: see `dadiff.planning.codec`. Entries are stored, not compressed, so that no file unpacks to more than its size.
 """
 
 from __future__ import annotations
@@ -65,10 +65,15 @@ def described(planner: Planner) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
 def in_folder(planner: Planner, weights: str | None) -> dict[str, bytes]:
     """The files, by name, from which a run's folder is loaded as a planner.
 
+    Where a part cannot be stored, such as a system made from a function, they say so to whoever loads them.
+
     Args:
         weights: the key of the trained denoiser in the cache; None where nothing is trained.
     """
-    description, arrays = described(planner)
+    try:
+        description, arrays = described(planner)
+    except CheckpointError as error:
+        return {DESCRIPTION: json.dumps({"format": FORMAT, "unavailable": str(error)}).encode()}
     return {DESCRIPTION: json.dumps({**description, "weights": weights}).encode(), ARRAYS: write_arrays(arrays)}
 
 
@@ -120,6 +125,8 @@ def _folder(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         )
     try:
         description = json.loads((path / DESCRIPTION).read_bytes())
+        if reason := description.get("unavailable"):
+            raise CheckpointError(f"{path}: cannot be loaded as a planner: {str(reason)[:300]}")
         arrays = read_arrays((path / ARRAYS).read_bytes())
         if (key := description.get("weights")) is None:
             return description, arrays

@@ -8,7 +8,7 @@ It knows no store, no stop-watch and no configuration.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -19,6 +19,7 @@ import torch
 
 from dadiff.behaviours import Pin, Projection, TrajectorySet
 from dadiff.diffusion.chain import Observe, Samples, sample
+from dadiff.diffusion.context import Project
 from dadiff.diffusion.enforcement import Enforcement
 from dadiff.diffusion.samplers import Sampler
 from dadiff.diffusion.schedule import Schedule
@@ -155,7 +156,7 @@ class Planner:
         self,
         E: np.ndarray,
         generator: torch.Generator,
-        project: Callable[[Any], Any] | None,
+        project: Project | None,
         observe: Observe | None = None,
         start: np.ndarray | None = None,
         *,

@@ -214,6 +214,26 @@ class TrajectoryLayout(Layout):
         return self.channels[1].shape[0]
 
     @property
+    def state_names(self) -> tuple[str, ...]:
+        """One for each state, or none."""
+        return self.channels[0].labels
+
+    @property
+    def input_names(self) -> tuple[str, ...]:
+        """One for each input, or none."""
+        return self.channels[1].labels
+
+    @property
+    def state_units(self) -> tuple[str, ...]:
+        """One for each state, or none."""
+        return self.channels[0].units
+
+    @property
+    def input_units(self) -> tuple[str, ...]:
+        """One for each input, or none."""
+        return self.channels[1].units
+
+    @property
     def rank(self) -> int:
         """n + mT, the degrees of freedom of an admissible trajectory: x(0) and the inputs."""
         return self.state_dim + self.channels[1].size
