@@ -53,7 +53,7 @@ def test_a_node_becomes_its_component():
 def test_defaults_written_out_or_left_out_are_the_same():
     short, long = (
         {"_target_": "dadiff.behaviours.Known"},
-        {"_target_": "dadiff.behaviours.Known", "initial_state": "free"},
+        {"_target_": "dadiff.behaviours.Known", "initial_state": "free", "sweeps": 1},
     )
     nodes = [assemble({**usual(), "projector": node}).nodes["projector"] for node in (short, long)]
     assert nodes == [long, long]
@@ -63,7 +63,10 @@ def test_defaults_written_out_or_left_out_are_the_same():
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("projector.foo=1", "projector (projector/known.yaml): key 'foo' is not known; known keys: initial_state"),
+        (
+            "projector.foo=1",
+            "projector (projector/known.yaml): key 'foo' is not known; known keys: initial_state, sweeps",
+        ),
         (
             "projector.initial_state=held",
             "projector (projector/known.yaml): initial_state is 'held': input should be 'free' or 'fixed'",

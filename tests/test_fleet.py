@@ -32,8 +32,8 @@ from dadiff.systems import (
 )
 from dadiff.systems.families import Ranges
 from dadiff.tasks import LQR, Fleet
-from dadiff.tasks.fleet import robot_table, transitions
 from dadiff.tasks.lqr import ends_layout
+from dadiff.tasks.robots import robot_table, transitions
 from dadiff.trajectory import Channel, Layout
 
 CONF = Path(__file__).parents[1] / "conf"
@@ -228,7 +228,7 @@ class TestBadInput:
             Linear([np.eye(2), np.eye(3)], [np.ones((2, 1)), np.ones((3, 1))])
 
     def test_a_single_system(self):
-        with pytest.raises(ConfigError, match="found a single system; choose system=damped_integrators"):
+        with pytest.raises(ConfigError, match="found another system; choose system=damped_integrators"):
             Fleet().target(double_integrator())
 
     def test_a_task_of_one_system_given_a_family(self, tmp_path):

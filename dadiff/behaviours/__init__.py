@@ -13,6 +13,7 @@ from dadiff.behaviours.components import (
     pins,
 )
 from dadiff.behaviours.least_squares import Estimate, Transitions, least_squares
+from dadiff.behaviours.manifold import Manifold
 from dadiff.behaviours.pins import Pin
 from dadiff.behaviours.projection import Projection, ProjectionInfo
 from dadiff.behaviours.sets import Dynamics, Everything, Rollout, Span, TrajectorySet, Uncertain, compared
@@ -28,6 +29,7 @@ __all__ = [
     "IdentifiedSoft",
     "Inpainting",
     "Known",
+    "Manifold",
     "NoProjector",
     "Pin",
     "Projection",

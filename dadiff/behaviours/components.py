@@ -12,11 +12,12 @@ from typing import ClassVar, Literal, Protocol, TypeVar
 import numpy as np
 
 from dadiff.behaviours.least_squares import Offset, Transitions, least_squares
+from dadiff.behaviours.manifold import Manifold
 from dadiff.behaviours.pins import Pin
 from dadiff.behaviours.sets import Dynamics, Everything, InitialState, Rollout, Span, TrajectorySet, Uncertain
 from dadiff.behaviours.stages import stages_of
 from dadiff.errors import ConfigError, ExcitationError
-from dadiff.systems import Recording, System
+from dadiff.systems import AffineSystem, Recording, System
 from dadiff.trajectory.hankel import identity_length, trajectory_matrix
 from dadiff.trajectory.layout import TrajectoryLayout
 from dadiff.trajectory.subspace import numerical_rank, rank_tolerance
@@ -95,12 +96,20 @@ class Inpainting:
 class Known:
     """P = F F† from known dynamics, eq. (5).
 
+    Of a nonlinear system: the trajectories that are nearest, by Gauss-Newton sweeps of LQR tracking.
+
     Args:
         initial_state: `fixed` projects onto the trajectories with x(0) = x_init.
+        sweeps: for each projection onto nonlinear dynamics; more than one where a plan is projected once (post hoc).
     """
 
     initial_state: InitialState = "free"
+    sweeps: int = 1
     needs: ClassVar[frozenset[str]] = SYSTEM
+
+    def __post_init__(self) -> None:
+        if self.sweeps < 1:
+            raise ConfigError(f"projector: sweeps is {self.sweeps}; at least one is needed")
 
     def fit(
         self,
@@ -108,10 +117,13 @@ class Known:
         system: System | None = None,
         recording: Recording | None = None,
         demonstrations: np.ndarray | None = None,
-    ) -> Dynamics:
+    ) -> Dynamics | Manifold:
         """The trajectories of the system."""
         system = _required(system, "known", "system")
-        return Dynamics(layout, stages_of(system, layout.horizon), notes={"rank": layout.rank})
+        notes: dict[str, float] = {"rank": layout.rank}
+        if not isinstance(system, AffineSystem):
+            return Manifold(layout, system, self.sweeps, notes=notes)
+        return Dynamics(layout, stages_of(system, layout.horizon), notes=notes)
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from dadiff.errors import ShapeError
 from dadiff.trajectory.arrays import Array, like
 from dadiff.trajectory.covariance import Covariance
 
-Kind = Literal["dense", "blocks"]
+Kind = Literal["dense", "blocks", "manifold"]
 
 KEPT = 64  # metrics that a projection holds converted, the oldest given up first
 
@@ -29,7 +29,7 @@ class ProjectionInfo:
 
     Args:
         rank: degrees of freedom that are left.
-        kind: `dense` matrices, or a recursion over `blocks` in O(T).
+        kind: `dense` matrices, a recursion over `blocks` in O(T), or sweeps of it along a `manifold`.
         iterations: of the last call; 1 for a closed form.
         residual: how far the last call's result is from the set, 0 where that is rounding.
         unconverged: plans of the last call that did not reach the set.
@@ -113,6 +113,16 @@ class Geometry:
         return self._forms[metric]
 
 
+def check_shape(tau: Array, shape: tuple[int, ...]) -> None:
+    """Raise `ShapeError` unless tau is (*robots, ..., d) for a shape (*robots, d)."""
+    *robots, d = shape
+    if (*tau.shape[: len(robots)], tau.shape[-1]) != shape or tau.ndim <= len(robots):
+        raise ShapeError(
+            f"projection: made for trajectories of shape {(*robots, '...', d)} (robots first), found "
+            f"{tuple(tau.shape)}; build the projector from these robots' systems or recordings"
+        )
+
+
 class Projection:
     """A set bound to coordinates and to the pins of its plans. Numpy arrays give numpy arrays, tensors give tensors.
 
@@ -147,12 +157,8 @@ class Projection:
         Raises:
             ShapeError: if tau does not fit the robots.
         """
+        check_shape(tau, self._shape)
         *robots, d = self._shape
-        if (*tau.shape[: len(robots)], tau.shape[-1]) != self._shape or tau.ndim <= len(robots):
-            raise ShapeError(
-                f"projection: made for trajectories of shape {(*robots, '...', d)} (robots first), found "
-                f"{tuple(tau.shape)}; build the projector from these robots' systems or recordings"
-            )
         if self._geometry.kind == "blocks" and not isinstance(tau, np.ndarray) and tau.device.type == "cpu":
             # Many small products, which numpy starts faster.
             drawn = None if noise is None else noise.numpy()

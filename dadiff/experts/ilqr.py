@@ -19,7 +19,7 @@ from functools import cached_property
 import numpy as np
 
 from dadiff.errors import ConfigError, ShapeError
-from dadiff.systems.system import System
+from dadiff.systems import System
 from dadiff.trajectory.layout import TrajectoryLayout
 
 _BACKTRACKS = 8

@@ -1,23 +1,30 @@
-"""Systems: linear dynamics, families of robots, and recordings of them."""
+"""Systems: linear and nonlinear dynamics, families of robots, and recordings of them."""
 
 from dadiff.systems.families import DampedIntegrators, Family, LaggedIntegrators, Robots, RotatedIntegrators
 from dadiff.systems.given import from_control, inline
 from dadiff.systems.integrators import double_integrator
 from dadiff.systems.linear import AffineSystem, Linear, TimeVarying, require_affine
+from dadiff.systems.nonlinear import Continuous, Nonlinear, Simulated
+from dadiff.systems.quadrotors import PlanarQuadrotor, PlanarQuadrotors
 from dadiff.systems.recording import GaussianExcitation, Recording
 from dadiff.systems.system import Bounds, System
 
 __all__ = [
     "AffineSystem",
     "Bounds",
+    "Continuous",
     "DampedIntegrators",
     "Family",
     "GaussianExcitation",
     "LaggedIntegrators",
     "Linear",
+    "Nonlinear",
+    "PlanarQuadrotor",
+    "PlanarQuadrotors",
     "Recording",
     "Robots",
     "RotatedIntegrators",
+    "Simulated",
     "System",
     "TimeVarying",
     "double_integrator",

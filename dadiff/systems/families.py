@@ -1,7 +1,7 @@
-"""Families of robots: linear systems whose parameters are drawn from ranges, so that one data set holds many dynamics.
+"""Families of robots: systems whose parameters are drawn from ranges, so that one data set holds many dynamics.
 
-All robots of a family share n and m. A family says which parameters it has and how (A, B) follow from them;
-drawing robots inside and outside the ranges is the same for all.
+All robots of a family share n and m. A family says which parameters it has and how its robots, or their (A, B), follow
+from them; drawing robots inside and outside the ranges is the same for all.
 """
 
 from __future__ import annotations
@@ -9,17 +9,17 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar
+from typing import Any, ClassVar, Generic, Self, TypeVar
 
 import numpy as np
 
 from dadiff.errors import ConfigError
 from dadiff.systems.linear import Linear
-from dadiff.systems.system import Bounds, Limits
+from dadiff.systems.system import Bounds, Limits, System
 
 
 @dataclass(frozen=True, kw_only=True)
-class Robots(Linear):
+class Robots(System):
     """A fleet, and the parameters that tell its robots apart.
 
     Args:
@@ -35,11 +35,14 @@ class Robots(Linear):
         """(robots, p), in the order of their names."""
         return np.stack(list(self.parameters.values()), axis=-1)
 
-    def take(self, index: Sequence[int] | np.ndarray) -> Robots:
+    def take(self, index: Sequence[int] | np.ndarray) -> Self:
         """The robots at `index`."""
         parameters = {name: values[index] for name, values in self.parameters.items()}
-        arrays = {name: getattr(self, name)[index] for name in ("A", "B", "c", "distance")}
-        return replace(self, **arrays, robots=arrays["distance"].shape, parameters=parameters)
+        return replace(self, parameters=parameters, distance=self.distance[index], **self._taken(index))
+
+    @abstractmethod
+    def _taken(self, index: Sequence[int] | np.ndarray) -> dict[str, Any]:
+        """Other fields of the robots at `index`, by name."""
 
     def most_different(self, count: int) -> np.ndarray:
         """Indices of at most `count` robots: the one farthest out, then each as far as possible from those before."""
@@ -50,6 +53,15 @@ class Robots(Linear):
             apart = np.linalg.norm(table[:, None] - table[chosen], axis=-1).min(axis=-1)
             chosen.append(int(apart.argmax()))
         return np.array(chosen)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LinearRobots(Linear, Robots):
+    """A fleet of linear systems."""
+
+    def _taken(self, index: Sequence[int] | np.ndarray) -> dict[str, Any]:
+        arrays = {name: getattr(self, name)[index] for name in ("A", "B", "c")}
+        return {**arrays, "robots": arrays["A"].shape[:1]}
 
 
 @dataclass(frozen=True)
@@ -115,7 +127,10 @@ class Ranges:
         return np.linalg.norm(excess, axis=-1)
 
 
-class Family(ABC):
+Drawn = TypeVar("Drawn", bound=Robots)
+
+
+class Family(ABC, Generic[Drawn]):
     """A dataclass of ranges and constants, with a yaml in `conf/system/`."""
 
     state_names: ClassVar[tuple[str, ...]] = ()
@@ -139,14 +154,34 @@ class Family(ABC):
         """What is drawn."""
 
     @abstractmethod
+    def robots(self, values: np.ndarray) -> Drawn:
+        """The robots with parameters (robots, p)."""
+
+    def named(self, values: np.ndarray) -> dict[str, np.ndarray]:
+        """One array (robots,) a parameter from (robots, p), by name, in the order of `ranges`."""
+        return dict(zip(self.ranges.bounds, np.moveaxis(values, -1, 0), strict=True))
+
+    def inside(self, count: int, rng: np.random.Generator) -> Drawn:
+        """`count` robots drawn uniformly from the ranges."""
+        return self.robots(self.ranges.inside(count, rng))
+
+    def outside(self, count: int, factor: float, rng: np.random.Generator) -> Drawn:
+        """`count` robots from outside the ranges, see `Ranges.outside`."""
+        return self.robots(self.ranges.outside(count, factor, rng))
+
+
+class LinearFamily(Family[LinearRobots]):
+    """A family of linear systems: (A, B) follow from the parameters."""
+
+    @abstractmethod
     def dynamics(self, *parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """A (robots, n, n) and B (robots, n, m) from one array (robots,) a parameter, in the order of `ranges`."""
 
-    def robots(self, values: np.ndarray) -> Robots:
+    def robots(self, values: np.ndarray) -> LinearRobots:
         """The robots with parameters (robots, p)."""
-        columns = dict(zip(self.ranges.bounds, np.moveaxis(values, -1, 0), strict=True))
-        A, B = self.dynamics(*columns.values())
-        return Robots(
+        parameters = self.named(values)
+        A, B = self.dynamics(*parameters.values())
+        return LinearRobots(
             A,
             B,
             robots=A.shape[:1],
@@ -155,17 +190,9 @@ class Family(ABC):
             bounds=Bounds.of(self.bounds),
             state_names=self.state_names,
             input_names=self.input_names,
-            parameters=columns,
+            parameters=parameters,
             distance=self.ranges.distance(values),
         )
-
-    def inside(self, count: int, rng: np.random.Generator) -> Robots:
-        """`count` robots drawn uniformly from the ranges."""
-        return self.robots(self.ranges.inside(count, rng))
-
-    def outside(self, count: int, factor: float, rng: np.random.Generator) -> Robots:
-        """`count` robots from outside the ranges, see `Ranges.outside`."""
-        return self.robots(self.ranges.outside(count, factor, rng))
 
 
 def blocks(rows: Sequence[Sequence[np.ndarray]]) -> np.ndarray:
@@ -175,7 +202,7 @@ def blocks(rows: Sequence[Sequence[np.ndarray]]) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class DampedIntegrators(Family):
+class DampedIntegrators(LinearFamily):
     """Planar robots with viscous damping c and input gain b, forward Euler; n = 4, m = 2.
 
         p(t+1) = p(t) + h v(t),    v(t+1) = (1 - h c) v(t) + h b u(t)
@@ -213,7 +240,7 @@ class DampedIntegrators(Family):
 
 
 @dataclass(frozen=True)
-class RotatedIntegrators(Family):
+class RotatedIntegrators(LinearFamily):
     """Damped integrators that push in a direction turned by a; n = 4, m = 2. No axis can be planned for alone.
 
         p(t+1) = p(t) + h v(t),    v(t+1) = (1 - h c) v(t) + h b [[cos a, -sin a], [sin a, cos a]] u(t)
@@ -254,7 +281,7 @@ class RotatedIntegrators(Family):
 
 
 @dataclass(frozen=True)
-class LaggedIntegrators(Family):
+class LaggedIntegrators(LinearFamily):
     """Damped integrators whose force f follows the input with a lag; third order, n = 6, m = 2.
 
         p(t+1) = p(t) + h v(t),  v(t+1) = (1 - h c) v(t) + h f(t),  f(t+1) = e^(-h/l) f(t) + (1 - e^(-h/l)) b u(t)

@@ -1,12 +1,17 @@
-"""Planar quadrotors: six states, two inputs, and as many robots as there are sets of parameters."""
+"""Planar quadrotors: six states, two inputs, and a family of them."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any, ClassVar
 
 import numpy as np
 
+from dadiff.errors import ConfigError
+from dadiff.systems.families import Family, Ranges, Robots
 from dadiff.systems.nonlinear import Continuous
+from dadiff.systems.system import Bounds, Limits
 
 GRAVITY = 9.81  # m/s^2
 
@@ -70,10 +75,65 @@ class PlanarQuadrotor(Continuous):
         f_u[..., 3, 0], f_u[..., 4, 0], f_u[..., 5, 1] = -a * sin, a * cos, b
         return f_x, f_u
 
-    def _parameters(self, x: np.ndarray) -> list[np.ndarray]:
+    def _parameters(self, x: np.ndarray) -> list[float | np.ndarray]:
         """a, b, c with as many dimensions as the points have: robots first."""
-        robots = self.robots
-        shape = (*robots, *(1,) * (x.ndim - 1 - len(robots)))
-        return [
-            np.broadcast_to(value, robots).reshape(shape) for value in (self.thrust_gain, self.torque_gain, self.drag)
-        ]
+        values = [self.thrust_gain, self.torque_gain, self.drag]
+        if not self.robots:
+            return values
+        return [np.reshape(value, (*self.robots, *(1,) * (x.ndim - 2))) for value in values]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Quadrotors(PlanarQuadrotor, Robots):
+    """A fleet of planar quadrotors."""
+
+    def _taken(self, index: Sequence[int] | np.ndarray) -> dict[str, Any]:
+        return {name: getattr(self, name)[index] for name in ("thrust_gain", "torque_gain", "drag")}
+
+
+@dataclass(frozen=True)
+class PlanarQuadrotors(Family[Quadrotors]):
+    """Planar quadrotors that answer differently to the same inputs, see `PlanarQuadrotor`; n = 6, m = 2.
+
+    Args:
+        thrust_gain, torque_gain: ranges of a and b, positive.
+        drag: range of c, 1/s.
+        time_step: of the integrator (RK4), in seconds.
+        process_noise: standard deviation of w(t) per step, a number or one for each state.
+        bounds: any of input_low, input_high, state_low, state_high; a number, or one for each entry.
+    """
+
+    state_names: ClassVar[tuple[str, ...]] = PlanarQuadrotor.state_names
+    input_names: ClassVar[tuple[str, ...]] = PlanarQuadrotor.input_names
+
+    thrust_gain: Sequence[float] = (0.5, 1.5)
+    torque_gain: Sequence[float] = (0.4, 2.0)
+    drag: Sequence[float] = (0.0, 1.0)
+    time_step: float = 0.05
+    process_noise: float | Sequence[float] = 0.01
+    bounds: Limits | None = None
+
+    def __post_init__(self) -> None:
+        self.check()
+        for name in ("thrust_gain", "torque_gain"):
+            if not getattr(self, name)[0] > 0:
+                raise ConfigError(f"system: the range of {name} is {list(getattr(self, name))}; a gain is positive")
+
+    @property
+    def ranges(self) -> Ranges:
+        """Of a, b and c."""
+        return Ranges({"thrust_gain": self.thrust_gain, "torque_gain": self.torque_gain, "drag": self.drag})
+
+    def robots(self, values: np.ndarray) -> Quadrotors:
+        """The robots with parameters (robots, p)."""
+        thrust_gain, torque_gain, drag = np.moveaxis(values, -1, 0)
+        return Quadrotors(
+            thrust_gain=thrust_gain,
+            torque_gain=torque_gain,
+            drag=drag,
+            time_step=self.time_step,
+            process_noise=self.process_noise,
+            bounds=Bounds.of(self.bounds),
+            parameters=self.named(values),
+            distance=self.ranges.distance(values),
+        )

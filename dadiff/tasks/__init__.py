@@ -2,6 +2,7 @@
 
 from dadiff.tasks.fleet import Fleet
 from dadiff.tasks.lqr import LQR
+from dadiff.tasks.manoeuvre import Manoeuvre
 from dadiff.tasks.task import Cases, Demonstrations, Scores, Task
 
-__all__ = ["LQR", "Cases", "Demonstrations", "Fleet", "Scores", "Task"]
+__all__ = ["LQR", "Cases", "Demonstrations", "Fleet", "Manoeuvre", "Scores", "Task"]

@@ -83,10 +83,13 @@ class Covariance:
     def leading(self, count: int) -> Covariance:
         """The `count` leading directions of C, and of the others the variances alone: diag(D) + U U' with k = count.
 
-        The variance of every entry is kept.
+        The variance of every entry is kept. As in probabilistic PCA, U takes of each direction what exceeds the mean
+        of the others, so that equal variances beside that many directions are kept as they are.
         """
         values, vectors = np.linalg.eigh(self.matrix)
-        factor = vectors[..., self.size - count :] * np.sqrt(np.maximum(values[..., None, self.size - count :], 0))
+        others = values[..., : self.size - count].mean(axis=-1, keepdims=True) if count < self.size else 0.0
+        leading = np.maximum(values[..., self.size - count :] - others, 0)
+        factor = vectors[..., self.size - count :] * np.sqrt(leading)[..., None, :]
         rest = np.einsum("...ii->...i", self.matrix) - np.square(factor).sum(axis=-1)
         return Covariance(np.maximum(rest, 0), factor)
 
