@@ -142,7 +142,9 @@ def chain_table(steps: int, *, grows: bool) -> pd.DataFrame:
         "off_support": np.repeat(1e-6 + (i / steps) ** 3, 2),
         "grew": np.where(np.arange(2 * steps) % 6 == 5, 0.4 * grows, 0.0),
     }
-    return pd.DataFrame(rows)
+    table = pd.DataFrame(rows)
+    growth = np.where(table["grew"] > 0, 5.0, -1.0)
+    return table.assign(growth=growth, growth_error=0.5, step_growth=growth, step_growth_error=0.5)
 
 
 def example_arrays(horizon: int, error: float, *, obstacles: bool = False) -> dict[str, np.ndarray]:

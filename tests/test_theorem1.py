@@ -92,11 +92,16 @@ def share_that_grew(table: pd.DataFrame, stage: str) -> float:
 
 def test_the_chain_is_recorded_half_step_by_half_step():
     _, table = chain(Normalised())
-    assert list(table.columns) == ["i", "stage", "on_support", "off_support", "grew"]
+    growth = ["growth", "growth_error", "step_growth", "step_growth_error"]
+    assert list(table.columns) == ["i", "stage", "on_support", "off_support", "grew", *growth]
     first = next(step.i for step in DDPM().steps(paper_linear()) if step.call)
     assert list(table.i) == [first, *(j for j in range(first - 1, -1, -1) for _ in range(2))]
     assert list(table.stage) == ["project", *["predict", "project"] * first]
     assert table.grew.isna().sum() == 1  # the first has nothing before it
+    distance = table.on_support.to_numpy()
+    np.testing.assert_allclose(table.growth[1:], np.diff(distance), rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(table.step_growth[2::2], distance[2::2] - distance[:-2:2], rtol=1e-6, atol=1e-6)
+    assert (table.growth_error[1:] >= 0).all()
 
 
 def test_projections_bring_plans_nearer_to_the_law_and_predictions_do_not_always():

@@ -53,6 +53,9 @@ def headline(scores: Scores) -> dict[str, float]:
 class ChainRecorder:
     """The Mahalanobis distance of Theorem 1 after each prediction and each projection, averaged over plans.
 
+    Growth is that of the squared distance on the support over the half-step, its mean over the plans and the standard
+    error of that mean; `step_growth` is that since the step before, so on a step's last row it is the whole step's.
+
     Args:
         distance: of plans (k, d) in physical units, on and off the support.
         plans: indices of the k plans that are followed.
@@ -63,20 +66,28 @@ class ChainRecorder:
     plans: np.ndarray
     to_physical: Callable[[np.ndarray], np.ndarray]
     rows: list[dict[str, Any]] = field(default_factory=list)
-    _last: np.ndarray | None = None
+    _seen: list[tuple[int, np.ndarray]] = field(default_factory=list)
 
     def __call__(self, j: int, stage: Stage, tau: Any) -> None:
         """Record one half-step that reached step j; the end is none."""
         if stage == "end":
             return
         on, off = self.distance(self.to_physical(tau[self.plans].cpu().numpy()))
-        grew = float("nan") if self._last is None else float((on > self._last * (1 + 1e-9)).mean())
-        self.rows.append({"i": j, "stage": stage, "on_support": on.mean(), "off_support": off.mean(), "grew": grew})
-        self._last = on
+        last = self._seen[-1][1] if self._seen else np.full_like(on, np.nan)
+        step = next((seen for i, seen in reversed(self._seen) if i != j), np.full_like(on, np.nan))
+        grew = float("nan") if not self._seen else float((on > last * (1 + 1e-9)).mean())
+        row = {"i": j, "stage": stage, "on_support": on.mean(), "off_support": off.mean(), "grew": grew}
+        self.rows.append(row | _growth("growth", on - last) | _growth("step_growth", on - step))
+        self._seen = [*self._seen[-1:], (j, on)]
 
     def table(self) -> pd.DataFrame:
         """One row a half-step."""
         return pd.DataFrame(self.rows)
+
+
+def _growth(name: str, change: np.ndarray) -> dict[str, float]:
+    error = change.std(ddof=1) / np.sqrt(len(change)) if len(change) > 1 else float("nan")
+    return {name: float(change.mean()), f"{name}_error": float(error)}
 
 
 @dataclass

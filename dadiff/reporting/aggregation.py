@@ -117,6 +117,11 @@ class Method:
         return Runs(levels, _objects(self.finished)[places])
 
     @property
+    def identity(self) -> bool:
+        """Whether its projector leaves everything as it is, so that it is another method's twin."""
+        return any(cell.identity for cell in self.finished)
+
+    @property
     def keys(self) -> list[str]:
         """Keys of the runs that numbers come from."""
         return self.runs.keys if self.finished else []

@@ -5,11 +5,14 @@ A measure takes the evidence, the methods, the axes for their labels, and its ow
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import pandas as pd
+from scipy.special import ndtri
 
 from dadiff.reporting.aggregation import FLOORS, Evidence, Method, Runs, has_metric, pair, pairs
 from dadiff.reporting.labels import axis_value, method_name, metric_name, with_interval
@@ -19,7 +22,12 @@ from dadiff.reporting.statistics import Band, Draws, Estimate, mean, ratio, rati
 
 @dataclass(frozen=True)
 class Measured:
-    """One method's estimate and what it says in words; None if it diverged or has no result."""
+    """One method's estimate and what it says in words; None if it is set aside.
+
+    Args:
+        estimate: what the rule is asked of.
+        effect: what a reader wants to know, where that is something else.
+    """
 
     label: str
     axes: dict[str, Any]
@@ -27,17 +35,22 @@ class Measured:
     text: str
     runs: list[str]
     diverged: bool = False
+    effect: Estimate | None = None
 
 
 Measure = Callable[..., list[Measured]]
 
+IDENTITY = "the projector is the identity"
+
 
 def _usable(methods: list[Method], shown: list[str], out: list[Measured], metric: str = "") -> Iterator[Method]:
-    """Methods with results; what became of the others goes to `out`."""
+    """Methods with results that say something; what became of the others goes to `out`."""
     for method in methods:
         if method.diverged or not method.finished:
             label = method_name(method.axes, shown)
             out.append(Measured(label, method.axes, None, method.outcome, method.keys, method.diverged))
+        elif method.identity:
+            out.append(_without(method, shown, IDENTITY))
         elif metric and not has_metric(method.finished, metric):
             out.append(_without(method, shown, f"has no {metric_name(metric)}"))
         else:
@@ -97,17 +110,10 @@ def at_every_time(
             out.append(_without(method, shown, f"{metric_name(metric)} is defined nowhere"))
             continue
         estimate = Estimate(*(float(np.nanmax(part)) for part in (found.value, found.low, found.high)))
-        whole = _words(ratio(own.scalars(metric), theirs.scalars(metric)))
-        text = f"{metric_name(metric)} {whole} times that of {_name_of(other, against)}, {_along(found)}"
-        out.append(
-            Measured(
-                method_name(method.axes, shown),
-                method.axes,
-                estimate,
-                text + _lost(method, other),
-                _keys(own, theirs),
-            )
-        )
+        whole = ratio(own.scalars(metric), theirs.scalars(metric))
+        text = f"{metric_name(metric)} {_words(whole)} times that of {_name_of(other, against)}, {_along(found)}"
+        label, keys = method_name(method.axes, shown), _keys(own, theirs)
+        out.append(Measured(label, method.axes, estimate, text + _lost(method, other), keys, effect=whole))
     return out
 
 
@@ -161,24 +167,42 @@ def _groups(methods: list[Method], axis: str) -> list[list[Method]]:
     return [sorted(group, key=lambda m: m.axes[axis]) for group in groups.values()]
 
 
-def share_grew(evidence: Evidence, methods: list[Method], shown: list[str], *, stage: str) -> list[Measured]:
-    """The largest share of plans, over the half-steps of a stage, whose distance of Theorem 1 grew. Counted, exact."""
+def steps_grew(evidence: Evidence, methods: list[Method], shown: list[str], *, stages: list[str]) -> list[Measured]:
+    """The share of steps at which the mean over plans of the distance of Theorem 1 clearly grew.
+
+    Clearly: by more than chance at any of the steps, one-sided at 5 % for all of them together (Bonferroni).
+
+    Args:
+        stages: "whole" steps, or the half-steps "predict" and "project"; a finding each.
+    """
     out: list[Measured] = []
-    for method in methods:
-        label, followed = method_name(method.axes, shown), [cell for cell in method.cells if cell.has("chain")]
-        if not followed:
-            out.append(Measured(label, method.axes, None, method.outcome or "its chain was not followed", []))
+    for method, stage in itertools.product(methods, stages):
+        axes = {**method.axes, "stage": stage}
+        label = ", ".join([method_name(method.axes, shown), *[STAGES[stage]] * (len(stages) > 1)])
+        followed = [cell for cell in method.cells if cell.has_column("chain", "step_growth")]
+        growth = [_growth(cell.table("chain"), stage) for cell in followed]
+        if not sum(map(len, growth)):
+            why = method.outcome if method.lost and not followed else "its chain was not followed in such steps"
+            out.append(Measured(label, axes, None, why, []))
             continue
-        rows = [cell.table("chain") for cell in followed]
-        grew = np.concatenate([table.loc[table["stage"] == stage, "grew"].dropna() for table in rows])
-        if not grew.size:
-            out.append(Measured(label, method.axes, None, "its chain has no half-step of this kind", []))
-            continue
-        estimate = Estimate(*(float(grew.max()),) * 3)
-        steps = f"{int((grew > 0).sum())} of {len(grew)} half-steps"
-        text = f"the distance grew for up to {100 * grew.max():.3g} % of the plans, in {steps}"
-        out.append(Measured(label, method.axes, estimate, text, [cell.key for cell in followed]))
+        steps = pd.concat(growth)
+        grew = int((steps["mean"] > steps["error"] * ndtri(1 - 0.05 / len(steps))).sum())
+        estimate = Estimate(*(grew / len(steps),) * 3)
+        text = f"the mean distance grew in {grew} of {len(steps)} steps"
+        out.append(Measured(label, axes, estimate, text, [cell.key for cell in followed]))
     return out
+
+
+STAGES = {"whole": "whole steps", "predict": "predictions", "project": "projections"}
+
+
+def _growth(chain: pd.DataFrame, stage: str) -> pd.DataFrame:
+    """Mean growth of the distance over each step, or half-step, and the error of that mean."""
+    if stage == "whole":
+        found = chain.groupby("i", sort=False)[["step_growth", "step_growth_error"]].last()
+    else:
+        found = chain.loc[chain["stage"] == stage, ["growth", "growth_error"]]
+    return found.set_axis(["mean", "error"], axis=1).dropna()
 
 
 def projection_share(evidence: Evidence, methods: list[Method], shown: list[str]) -> list[Measured]:
@@ -241,7 +265,7 @@ MEASURES: dict[str, Measure] = {
         at_every_time,
         dip,
         longest_over_shortest,
-        share_grew,
+        steps_grew,
         projection_share,
         schedule_conditions,
     )

@@ -111,6 +111,15 @@ class Cell:
         """Headline scalars."""
         return self.run.metrics if self.run else {}
 
+    @property
+    def identity(self) -> bool:
+        """Whether its projector leaves everything as it is: its rank is that of all trajectories (from x(0))."""
+        if "rank" not in self.metrics or "inputs" not in self.examples:
+            return False
+        (horizon, m), n = self.examples["inputs"].shape[-2:], self.examples["states"].shape[-1]
+        free = n * (horizon + (self.axes.get("initial_state") != "fixed")) + m * horizon
+        return bool(self.metrics["rank"] >= free)
+
     def has(self, table: str) -> bool:
         """Whether the run holds this table."""
         return self.run is not None and self.run.has(table)

@@ -132,10 +132,22 @@ class LQR:
         return (deviation**2 @ np.diag(self.Q)).sum(-1) + self.input_cost * (inputs**2).sum((-2, -1))
 
     def score(self, system: AffineSystem, cases: Cases, planned: np.ndarray, rollout: np.ndarray) -> Scores:
-        """The cost after replay, relative to the noise-free finite-horizon optimum of the case."""
+        """The cost after replay over that of the noise-free finite-horizon optimum; and how widely plans are spread.
+
+        Spread is the trace of the covariance of a case's plans over that of the law of optimal trajectories, 1 for
+        right samples: each plan's squared distance from their mean, S / (S - 1) times, over the trace.
+        """
         target = cases.get("target")
         feedback = optimal_feedback(system, self.Q, self.R(system), self.horizon)
         ends = ends_layout(system).pack(x_init=cases.x_init, target=target)
         optimum = closed_loop_law(system, feedback).mean(ends)
         ratio = self.cost(system, rollout, target[..., None, :]) / self.cost(system, optimum, target)[..., None]
-        return Scores(per_plan={"cost_ratio": ratio})
+        return Scores(per_plan={"cost_ratio": ratio, **self._spread(system, planned)})
+
+    def _spread(self, system: AffineSystem, planned: np.ndarray) -> dict[str, np.ndarray]:
+        """Nothing of single plans, and where optimal trajectories have no spread."""
+        samples, trace = planned.shape[-2], np.square(self.law(system).noise_map).sum(axis=(-2, -1))
+        if samples < 2 or not np.all(trace > 0):
+            return {}
+        apart = np.square(planned - planned.mean(axis=-2, keepdims=True)).sum(axis=-1) * samples / (samples - 1)
+        return {"spread": apart / np.expand_dims(trace, (-2, -1))}
