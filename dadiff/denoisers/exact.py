@@ -76,6 +76,10 @@ class ExactDenoiser:
     @torch.inference_mode()
     def __call__(self, tau: Tensor, i: int, environment: Tensor) -> Tensor:
         """tau0_hat (*robots, ..., d) from tau of the same shape, i in 1..L and E (*robots, ..., c)."""
+        return self.estimate(tau, i, environment)
+
+    def estimate(self, tau: Tensor, i: int, environment: Tensor) -> Tensor:
+        """The same, recorded by autograd."""
         mu, a = self.mean(environment), float(self.alpha_bar[i])
         deviation = _along(self.basis.mT, tau - a**0.5 * mu)
         return mu + _along(self.basis, _beside(self._gain(a), tau) * deviation)

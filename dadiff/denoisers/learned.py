@@ -81,6 +81,10 @@ class NetworkDenoiser(nn.Module):
         Raises:
             ShapeError: if tau or E has another last dimension than the network was built for.
         """
+        return self.estimate(tau, i, environment)
+
+    def estimate(self, tau: Tensor, i: int, environment: Tensor) -> Tensor:
+        """The same, recorded by autograd."""
         self._check(tau, environment)
         E = environment.expand(*tau.shape[:-1], self.condition.size).reshape(-1, self.condition.size)
         flat = tau.reshape(-1, tau.shape[-1])

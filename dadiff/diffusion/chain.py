@@ -11,10 +11,10 @@ from tqdm import tqdm
 
 from dadiff.diffusion.context import Context, Counted, Denoise, Project, unprojected
 from dadiff.diffusion.enforcement import Enforcement, Never
+from dadiff.diffusion.estimate import Estimate
 from dadiff.diffusion.samplers import Sampler
 from dadiff.diffusion.schedule import Schedule
 from dadiff.diffusion.silence import begin
-from dadiff.trajectory.covariance import Covariance
 
 Tensor = torch.Tensor
 Stage = Literal["predict", "project", "end"]
@@ -49,7 +49,7 @@ def sample(
     observe: Observe | None = None,
     divergence_bound: float = 1e6,
     progress: bool = False,
-    covariance: Callable[[int], Covariance] | None = None,
+    estimate: Estimate | None = None,
 ) -> Samples:
     """Algorithm 1 (and 2, which differ in P): predict, then project, from i = L to 1.
 
@@ -63,7 +63,7 @@ def sample(
             steps without a call that were drawn as one, what they end with.
         divergence_bound: the chain stops once max |tau| exceeds it.
         progress: show a progress bar.
-        covariance: i -> C_i, of the clean estimate, for enforcements that weigh by it.
+        estimate: how uncertain the clean estimate is, for enforcements that weigh by it.
 
     Returns:
         float64 plans; the chain as it stood if it diverged.
@@ -74,13 +74,14 @@ def sample(
 
     by = enforcement if enforcement and project else Never()
     ask, memory = Counted(denoise), dict[str, Any]()
-    tau, steps = begin(sampler.steps(schedule), schedule, noise, project or unprojected, by)  # line 1: tau_L ~ N(0, I)
+    planned = [by.weights(step, schedule) for step in sampler.steps(schedule)]
+    tau, steps = begin(planned, schedule, noise, project or unprojected, by)  # line 1: tau_L ~ N(0, I)
     if observe and steps[0].i < schedule.num_steps:
         observe(steps[0].i, "project", tau)
     tau0_hat = torch.zeros_like(tau)
     bar = tqdm(steps, desc="sampling", unit="step", disable=None if progress else True, leave=False)
     for step in bar:  # line 2: for i = L, ..., 1
-        at = Context(step, schedule, tau, environment, project or unprojected, ask, noise, covariance, memory)
+        at = Context(step, schedule, tau, environment, project or unprojected, ask, noise, estimate, memory)
         mean = step.sample * tau
         if step.call:  # line 3: the clean estimate from tau_i, i and E, and the mean that follows from it
             before, tau0_hat = tau0_hat, by.clean(ask(tau, step.i, environment), at)

@@ -6,6 +6,7 @@ from collections.abc import Callable, MutableMapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
 
+from dadiff.diffusion.estimate import Estimate
 from dadiff.diffusion.samplers import Step
 from dadiff.diffusion.schedule import Schedule
 from dadiff.errors import NotApplicableError
@@ -18,7 +19,13 @@ Denoise = Callable[[Array, int, Array], Array]
 class Project(Protocol):
     """The projection onto a set; see `dadiff.behaviours.Projection`."""
 
-    def __call__(self, tau: Array, metric: Covariance | None = None, start: Array | None = None) -> Array:
+    def __call__(
+        self,
+        tau: Array,
+        metric: Covariance | None = None,
+        start: Array | None = None,
+        noise: Array | None = None,
+    ) -> Array:
         """The admissible trajectory that is nearest to tau, in the metric of a covariance."""
         ...
 
@@ -55,7 +62,9 @@ class Counted:
         return self.denoise.estimate(tau, i, environment)
 
 
-def unprojected(tau: Array, metric: Covariance | None = None, start: Array | None = None) -> Array:
+def unprojected(
+    tau: Array, metric: Covariance | None = None, start: Array | None = None, noise: Array | None = None
+) -> Array:
     """tau: where there is nothing to project onto."""
     return tau
 
@@ -72,7 +81,7 @@ class Context:
         project: P.
         denoise: (tau, i, E) -> tau0_hat, to ask again; counted as a call.
         noise: draws unit noise of the shape of tau from the chain's generator.
-        covariance: i -> C_i, of the clean estimate at step i; None where none is known.
+        estimate: how uncertain the clean estimate is; None where nothing is known of it.
         memory: what an enforcement keeps from step to step; empty at the start of the chain.
     """
 
@@ -83,7 +92,7 @@ class Context:
     project: Project
     denoise: Counted
     noise: Callable[[], Array]
-    covariance: Callable[[int], Covariance] | None = None
+    estimate: Estimate | None = None
     memory: MutableMapping[str, Any] = field(default_factory=dict)
 
     @property
@@ -101,18 +110,18 @@ class Context:
         """alpha_bar_j."""
         return float(self.schedule.alpha_bar[self.j])
 
-    def metric(self) -> Covariance:
-        """C_i.
+    def known_estimate(self) -> Estimate:
+        """The estimate's law.
 
         Raises:
-            NotApplicableError: if no covariance of the estimate is known.
+            NotApplicableError: if nothing is known of it.
         """
-        if self.covariance is None:
+        if self.estimate is None:
             raise NotApplicableError(
-                "enforcement: it needs the covariance of the clean estimate, and none is known; give one "
-                "(dadiff.diffusion.estimate), or use another enforcement"
+                "enforcement: it weighs by the covariance of the clean estimate, and none is known; give the sampler "
+                "an Estimate (dadiff.diffusion.estimate), or use another enforcement"
             )
-        return self.covariance(self.step.i)
+        return self.estimate
 
     def pull_back(self, cotangent: Array) -> Array:
         """J' v with J = d tau0_hat / d tau_i and v of the shape of tau: one more call, and one pass backwards.

@@ -13,14 +13,22 @@ from math import sqrt
 from typing import ClassVar, Literal, Protocol
 
 from dadiff.diffusion.context import Context
+from dadiff.diffusion.samplers import Step
 from dadiff.diffusion.schedule import Schedule
 from dadiff.trajectory.layout import Array
 
 
 class Enforcement(Protocol):
-    """What the sampler asks. `affine` tells whether the operator is meaningful for affine sets."""
+    """What the sampler asks.
+
+    `affine` tells whether the operator is meaningful for affine sets, `weighs` whether it asks for the covariance of
+    the clean estimate.
+    """
 
     affine: ClassVar[bool]
+    weighs: ClassVar[bool]
+
+    def weights(self, step: Step, schedule: Schedule) -> Step: ...
 
     def clean(self, tau0_hat: Array, at: Context) -> Array: ...
 
@@ -36,6 +44,11 @@ class Never:
     """Nothing is projected: vanilla diffusion, whatever the projector."""
 
     affine: ClassVar[bool] = True
+    weighs: ClassVar[bool] = False
+
+    def weights(self, step: Step, schedule: Schedule) -> Step:
+        """The step with the sampler's weights."""
+        return step
 
     def clean(self, tau0_hat: Array, at: Context) -> Array:
         """tau0_hat."""

@@ -21,6 +21,7 @@ from dadiff.behaviours import Pin, Projection, TrajectorySet
 from dadiff.diffusion.chain import Observe, Samples, sample
 from dadiff.diffusion.context import Project
 from dadiff.diffusion.enforcement import Enforcement
+from dadiff.diffusion.estimate import Estimate
 from dadiff.diffusion.samplers import Sampler
 from dadiff.diffusion.schedule import Schedule
 from dadiff.errors import NotApplicableError, ShapeError
@@ -59,6 +60,7 @@ class Planner:
         starts_fixed: whether x(0) is pinned to x_init of E.
         divergence_bound: a chain is stopped once a value exceeds it, in the sampler's coordinates.
         device: where the chain runs.
+        estimate: how uncertain the clean estimate is, where the enforcement weighs by it.
     """
 
     task: Task
@@ -72,6 +74,7 @@ class Planner:
     starts_fixed: bool = False
     divergence_bound: float = 1e6
     device: str = "cpu"
+    estimate: Estimate | None = field(default=None, repr=False)
 
     @cached_property
     def layout(self) -> TrajectoryLayout:
@@ -175,6 +178,7 @@ class Planner:
             observe,
             self.divergence_bound,
             progress,
+            estimate=self.estimate,
         )
 
     def of(self, system: System, projector: Projector) -> Planner:

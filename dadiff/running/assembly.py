@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from dadiff.behaviours import TrajectorySet
 from dadiff.datasets.cached import load_data, save_data
 from dadiff.denoisers.recipes import ExactRecipe, Recipe
+from dadiff.diffusion.estimate import Estimate
 from dadiff.errors import ConfigError
 from dadiff.experts.lqr import GaussianLaw
 from dadiff.planning import Planner
@@ -153,7 +154,17 @@ class Experiment:
             getattr(self.parts.projector, "initial_state", "free") == "fixed",
             self.parts.evaluation.divergence_bound,
             self.device,
+            self.estimate if self.parts.enforcement.weighs and behaviour is not None else None,
         )
+
+    @property
+    def estimate(self) -> Estimate:
+        """How uncertain the clean estimate is: of an exact denoiser by its law, else by the demonstrations."""
+        shown, where = self.demonstrations, self.coordinates
+        if isinstance(self.parts.denoiser, ExactRecipe):
+            covariance = self.law.covariance / where.scale[:, None] / where.scale
+            return Estimate.of_covariance(self.layout, where, shown.trajectories, covariance)
+        return Estimate.of_demonstrations(self.layout, where, shown.trajectories, shown.environment)
 
     def prepare(self) -> None:
         """Build what is shared with other runs."""

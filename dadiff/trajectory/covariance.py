@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from dadiff.errors import ConfigError, ShapeError
+from dadiff.trajectory.arrays import Array
 from dadiff.trajectory.response import along
 from dadiff.trajectory.subspace import semidefinite_root
 
@@ -115,9 +116,14 @@ class Covariance:
         D[..., places], remaining[..., places, :] = 0, 0
         return Covariance(D, remaining), gain
 
+    def colour(self, eps: Array, more: Array) -> Array:
+        """A draw of N(0, C) from two of unit noise (*batch, ..., d), numpy or torch; k entries of `more` count."""
+        weights = self.diagonal**0.5
+        weights = weights.reshape(*weights.shape[:-1], *(1,) * (eps.ndim - weights.ndim), self.size)
+        return weights * eps + along(self.factor, more[..., : self.factor.shape[-1]])
+
     def draw(self, rng: np.random.Generator, shape: tuple[int, ...] = ()) -> np.ndarray:
         """Samples of N(0, C), (*batch, *shape, d)."""
-        batch, k = self.diagonal.shape[:-1], self.factor.shape[-1]
-        eps = rng.standard_normal((*batch, *shape, self.size))
-        deviations = np.sqrt(self.diagonal).reshape(*batch, *(1,) * len(shape), self.size)
-        return deviations * eps + along(self.factor, rng.standard_normal((*batch, *shape, k)))
+        drawn = (*self.diagonal.shape[:-1], *shape)
+        eps, more = (rng.standard_normal((*drawn, size)) for size in (self.size, self.factor.shape[-1]))
+        return self.colour(eps, more)

@@ -1,0 +1,142 @@
+"""How uncertain the clean estimate is: C_i = Cov(tau_0 | tau_i, E).
+
+Given E, demonstrations spread about their mean with a covariance Sigma. Were that law Gaussian,
+
+    C_i = (Sigma^-1 + alpha_bar_i / (1 - alpha_bar_i) I)^-1,
+
+which one eigendecomposition of Sigma gives for every i. A network is also wrong by a bias that does not shrink with i:
+hence a floor, C_i + floor Sigma. Sigma says nothing of robots unlike those of the demonstrations: hence a shrinkage of
+Sigma towards equal variances of standardised channels. Everything is in the sampler's coordinates.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from dadiff.errors import ConfigError, ShapeError
+from dadiff.trajectory.coordinates import Coordinates, standardised
+from dadiff.trajectory.covariance import Covariance
+from dadiff.trajectory.layout import TrajectoryLayout
+
+KEPT = 64  # covariances that are held, the oldest given up first
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """Sigma, and the units in which it may be shrunk.
+
+    Args:
+        covariance: Sigma of shape (*robots, d, d).
+        deviation: of the standardised channels, entry by entry, (d,).
+        unit: the length of a physical unit, entry by entry, (d,).
+    """
+
+    covariance: np.ndarray = field(repr=False)
+    deviation: np.ndarray = field(repr=False)
+    unit: np.ndarray = field(repr=False)
+    _spectra: dict[float, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict, init=False, repr=False)
+    _made: dict[tuple[float, ...], Covariance] = field(default_factory=dict, init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        d = self.deviation.shape[-1]
+        if self.covariance.shape[-2:] != (d, d) or self.unit.shape != self.deviation.shape:
+            raise ShapeError(
+                f"estimate: Sigma has shape {self.covariance.shape}, deviations {self.deviation.shape}, units "
+                f"{self.unit.shape}; expected (..., d, d), (d,), (d,)"
+            )
+        if not np.einsum("...ii->...i", self.covariance).any(axis=-1).all():
+            raise ConfigError(
+                "estimate: demonstrations do not spread at all given E, so nothing says which directions to trust; use "
+                "enforcement.metric=standardised"
+            )
+
+    @classmethod
+    def of_demonstrations(
+        cls, layout: TrajectoryLayout, coordinates: Coordinates, trajectories: np.ndarray, environment: np.ndarray
+    ) -> Estimate:
+        """Sigma of what linear regression on E leaves of the demonstrations.
+
+        Args:
+            trajectories: (N, d), physical units.
+            environment: E, (N, c).
+        """
+        residual = _residual(coordinates.to_scaled(trajectories), environment)
+        freedom = max(len(residual) - environment.shape[-1] - 1, 1)
+        return cls.of_covariance(layout, coordinates, trajectories, residual.T @ residual / freedom)
+
+    @classmethod
+    def of_covariance(
+        cls, layout: TrajectoryLayout, coordinates: Coordinates, trajectories: np.ndarray, covariance: np.ndarray
+    ) -> Estimate:
+        """A known Sigma (*robots, d, d) in the given coordinates; the channels' deviations from trajectories (N, d)."""
+        deviation = standardised(layout, trajectories).scale / coordinates.scale
+        return cls(covariance, deviation, 1 / coordinates.scale)
+
+    def at(self, alpha_bar: float, floor: float = 0.0, shrinkage: float = 0.0, directions: int = 0) -> Covariance:
+        """C_i + floor Sigma where alpha_bar_i is alpha_bar; one object for equal arguments.
+
+        Args:
+            shrinkage: s in (1 - s) Sigma + s v D^2, with D the deviations of the channels and v the mean variance of
+                D^-1 Sigma D^-1.
+            directions: how many leading directions are kept beside a diagonal, which makes long horizons cheap; 0 keeps
+                all.
+        """
+        return self._kept((alpha_bar, floor, shrinkage, directions), self._at)
+
+    def diagonal(self, alpha_bar: float, floor: float = 0.0) -> Covariance:
+        """C_i + floor Sigma of diag(Sigma): each entry for itself."""
+        return self._kept((alpha_bar, floor), self._diagonal)
+
+    def _kept(self, key: tuple[float, ...], make: Callable[..., Covariance]) -> Covariance:
+        if key not in self._made:
+            if len(self._made) == KEPT:
+                del self._made[next(iter(self._made))]
+            self._made[key] = make(*key)
+        return self._made[key]
+
+    def _diagonal(self, alpha_bar: float, floor: float) -> Covariance:
+        variance = np.einsum("...ii->...i", self.covariance)
+        return Covariance.diagonal_of(_posterior(variance, alpha_bar) + floor * variance)
+
+    @cached_property
+    def standardised(self) -> Covariance:
+        """Equal variances of the standardised channels."""
+        return Covariance.diagonal_of(self.deviation**2)
+
+    @cached_property
+    def physical(self) -> Covariance:
+        """Equal variances in physical units."""
+        return Covariance.diagonal_of(self.unit**2)
+
+    def _at(self, alpha_bar: float, floor: float, shrinkage: float, directions: int) -> Covariance:
+        variance, basis = self._spectrum(shrinkage)
+        remaining = _posterior(variance, alpha_bar) + floor * variance
+        C = Covariance(np.zeros(basis.shape[:-1]), basis * np.sqrt(remaining)[..., None, :])
+        return C.leading(directions) if directions else C
+
+    def _spectrum(self, shrinkage: float) -> tuple[np.ndarray, np.ndarray]:
+        """Variances (*robots, d) and directions (*robots, d, d) of Sigma after shrinkage."""
+        if shrinkage not in self._spectra:
+            across = self.covariance / self.deviation[:, None] / self.deviation
+            mean = np.einsum("...ii->...", across) / len(self.deviation)
+            equal = mean[..., None, None] * np.diag(self.deviation**2)
+            values, vectors = np.linalg.eigh((1 - shrinkage) * self.covariance + shrinkage * equal)
+            self._spectra[shrinkage] = np.maximum(values, 0), vectors
+        return self._spectra[shrinkage]
+
+
+def _residual(z: np.ndarray, environment: np.ndarray) -> np.ndarray:
+    """z (N, d) less its linear regression on E (N, c) and 1."""
+    regressors = np.concatenate([environment, np.ones((len(environment), 1))], axis=-1)
+    return z - regressors @ np.linalg.lstsq(regressors, z, rcond=None)[0]
+
+
+def _posterior(variance: np.ndarray, alpha_bar: float) -> np.ndarray:
+    """(1 / variance + alpha_bar / (1 - alpha_bar))^-1; finite for all alpha_bar in [0, 1]."""
+    noise = 1 - alpha_bar
+    total = alpha_bar * variance + noise
+    return np.divide(noise * variance, total, out=np.zeros_like(variance), where=total > 0)
