@@ -73,8 +73,8 @@ def test_defaults_written_out_or_left_out_are_the_same():
         ),
         ("task.horizon=thirty", "task (task/lqr.yaml): horizon is 'thirty': input should be a valid integer"),
         ("task.horizon=30.0", "task (task/lqr.yaml): horizon is 30.0: input should be a valid integer"),
-        ("task.state_cost=1", "task (task/lqr.yaml): state_cost is 1: "),
-        ("task.state_cost=[a]", "task (task/lqr.yaml): state_cost is 'a': input should be a valid number"),
+        ("task.state_cost=a", "task (task/lqr.yaml): state_cost is 'a': input should be a valid number"),
+        ("task.state_cost=[a]", "task (task/lqr.yaml): state_cost is ['a']: input should be a valid number"),
         (
             "sampler.last_step_noise=maybe",
             "sampler (sampler/ddpm.yaml): last_step_noise is 'maybe': input should be a valid boolean",

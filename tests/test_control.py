@@ -23,7 +23,7 @@ def disturbance(steps: int, size: float = 0.05) -> np.ndarray:
 
 
 def cost(states: np.ndarray, inputs: np.ndarray) -> np.ndarray:
-    return TASK.cost(SYSTEM, LAYOUT.flatten(states, inputs), CASES.get("target"))
+    return TASK.cost(SYSTEM)(states, inputs, CASES.get("target"))
 
 
 def test_open_loop_is_replay_with_and_without_disturbance():
@@ -39,7 +39,7 @@ def test_an_open_loop_ends_with_its_plan():
 
 
 def test_tracking_keeps_to_the_plan_where_open_loop_leaves_it():
-    gains = tracking_gains(SYSTEM, STATES, INPUTS, TASK.Q, np.eye(2))
+    gains = tracking_gains(SYSTEM, STATES, INPUTS, TASK.cost(SYSTEM).Q, np.eye(2))
     assert gains.shape == (6, 30, 2, 4)
     tracked = run(SYSTEM, Tracking(STATES, INPUTS, gains), CASES.x_init, 30, disturbance(30))
     blind = run(SYSTEM, OpenLoop(INPUTS), CASES.x_init, 30, disturbance(30))
@@ -54,9 +54,9 @@ def test_tracking_gains_solve_the_riccati_equation():
     import control
 
     x, u = np.zeros((1, 401, 4)), np.zeros((1, 400, 2))
-    gains = tracking_gains(SYSTEM, x, u, TASK.Q, np.eye(2))
+    gains = tracking_gains(SYSTEM, x, u, TASK.cost(SYSTEM).Q, np.eye(2))
     A, B, _ = SYSTEM.linearise(x[:, 0], u[:, 0])
-    expected = control.dlqr(A[0], B[0], TASK.Q, np.eye(2))[0]
+    expected = control.dlqr(A[0], B[0], TASK.cost(SYSTEM).Q, np.eye(2))[0]
     np.testing.assert_allclose(-gains[0, 0], expected, atol=1e-8)
 
 

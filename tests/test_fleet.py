@@ -246,7 +246,7 @@ class TestBadInput:
 
     def test_state_cost_of_another_length(self):
         lagged = LaggedIntegrators()
-        with pytest.raises(ConfigError, match="give one weight a state"):
+        with pytest.raises(ConfigError, match="give one weight for each state"):
             Fleet().demonstrations(lagged, 2, np.random.default_rng(0))
 
     def test_an_unstable_robot(self):

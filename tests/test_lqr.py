@@ -5,14 +5,16 @@ from __future__ import annotations
 import cvxpy as cp
 import numpy as np
 import pytest
-from laws import fleet, members
+from laws import AFFINE, fleet, members
 
-from dadiff.errors import ConfigError, InfeasibleError
+from dadiff.datasets import Generated
+from dadiff.errors import ConfigError, InfeasibleError, NotApplicableError
 from dadiff.evaluation import replay
 from dadiff.experts.lqr import closed_loop_law, follow, optimal_feedback, stationary_feedback
 from dadiff.randomness import numpy_generator
-from dadiff.systems import AffineSystem, Linear, double_integrator
-from dadiff.tasks import LQR
+from dadiff.systems import AffineSystem, DampedIntegrators, Linear, double_integrator
+from dadiff.tasks import LQR, Fleet
+from dadiff.tasks.obstacles import Obstacles
 from dadiff.trajectory.response import along
 
 
@@ -28,11 +30,11 @@ def optimum(system: Linear, task: LQR, count: int = 3) -> tuple[np.ndarray, np.n
 
 def by_qp(system: AffineSystem, task: LQR, E: np.ndarray):
     """States, inputs and cost of the optimum for one E by a solver of quadratic programs."""
-    n, T = system.state_dim, task.horizon
+    n, T, weights = system.state_dim, task.horizon, task.cost(system)
     x, u = cp.Variable((T + 1, n)), cp.Variable((T, system.input_dim))
-    root = np.linalg.cholesky(task.R(system))
-    deviation = x[:-1] - E[None, n:]
-    cost = cp.sum_squares(cp.multiply(deviation, np.sqrt(np.diag(task.Q))[None])) + cp.sum_squares(u @ root)
+    deviation = x - E[None, n:]
+    cost = sum(cp.quad_form(deviation[t], cp.psd_wrap(weights.Q)) + cp.quad_form(u[t], weights.R) for t in range(T))
+    cost += cp.quad_form(deviation[T], cp.psd_wrap(weights.terminal))
     A, B, c = system.matrices(T)
     dynamics = [x[0] == E[:n], *(x[t + 1] == A[t] @ x[t] + B[t] @ u[t] + c[t] for t in range(T))]
     problem = cp.Problem(cp.Minimize(cost), dynamics)
@@ -40,27 +42,45 @@ def by_qp(system: AffineSystem, task: LQR, E: np.ndarray):
     return x.value, u.value, problem.value
 
 
-def test_the_affine_optimum_is_the_qps(affine):
-    task = task_for(affine)
+def full(size: int, rank: int, seed: int) -> list[list[float]]:
+    """Rows of a random matrix, positive semidefinite of a rank."""
+    root = np.random.default_rng(seed).standard_normal((size, rank))
+    return (root @ root.T).tolist()
+
+
+def full_task(system: AffineSystem) -> LQR:
+    """Full Q and R, a terminal cost, ranges per state."""
+    n, m = system.state_dim, system.input_dim
+    ranges = {"init_range": [0.5, *[[-1.0, 3.0]] * (n - 1)], "target_range": [2.0] * n}
+    costs = {"state_cost": full(n, n - 1, 0), "input_cost": full(m, m + 1, 1), "terminal_cost": full(n, n, 2)}
+    return LQR(horizon=12, **costs, **ranges)
+
+
+@pytest.mark.parametrize("task_of", [task_for, full_task])
+def test_the_affine_optimum_is_the_qps(affine, task_of):
+    task = task_of(affine)
     (environment,), (tau,) = optimum(affine, task, count=1)
     states, inputs = affine.layout(task.horizon).split(tau)
     x, u, cost = by_qp(affine, task, environment)
     np.testing.assert_allclose(states, x, atol=1e-6)
     np.testing.assert_allclose(inputs, u, atol=1e-6)
-    np.testing.assert_allclose(task.cost(affine, tau, environment[affine.state_dim :]), cost, rtol=1e-8)
+    np.testing.assert_allclose(task.cost(affine)(states, inputs, environment[affine.state_dim :]), cost, rtol=1e-8)
 
 
-def test_the_gradient_of_the_cost_vanishes_at_the_optimum(affine):
-    """With lambda(t) = 2 Q (x(t) - target) + A_t' lambda(t+1), lambda(T) = 0: 2 R u(t) + B_t' lambda(t+1) = 0."""
-    task = task_for(affine)
+@pytest.mark.parametrize("task_of", [task_for, full_task])
+def test_the_gradient_of_the_cost_vanishes_at_the_optimum(affine, task_of):
+    """With lambda(t) = 2 Q (x(t) - target) + A_t' lambda(t+1), lambda(T) = 2 Q_T (x(T) - target):
+    2 R u(t) + B_t' lambda(t+1) = 0."""
+    task = task_of(affine)
     environment, tau = optimum(affine, task)
-    A, B, _ = affine.matrices(task.horizon)
+    (A, B, _), cost = affine.matrices(task.horizon), task.cost(affine)
     states, inputs = affine.layout(task.horizon).split(tau)
-    multiplier = np.zeros_like(states[:, 0])
+    deviation = states - environment[:, None, affine.state_dim :]
+    multiplier = 2 * deviation[:, -1] @ cost.terminal
     for t in reversed(range(task.horizon)):
-        gradient = 2 * inputs[:, t] @ task.R(affine) + multiplier @ B[t]
-        np.testing.assert_allclose(gradient, 0, atol=1e-10 * max(1, np.abs(multiplier).max()))
-        multiplier = 2 * (states[:, t] - environment[:, affine.state_dim :]) @ task.Q + multiplier @ A[t]
+        gradient = 2 * inputs[:, t] @ cost.R + multiplier @ B[t]
+        np.testing.assert_allclose(gradient, 0, atol=1e-9 * max(1, np.abs(multiplier).max()))
+        multiplier = 2 * deviation[:, t] @ cost.Q + multiplier @ A[t]
 
 
 def test_the_last_input_is_0_since_nothing_costs_at_T(affine):
@@ -73,11 +93,12 @@ def test_no_perturbation_of_the_inputs_is_cheaper(affine, rng):
     system, task = affine, task_for(affine)
     environment, tau = optimum(system, task)
     layout, target = system.layout(task.horizon), environment[:, system.state_dim :]
-    best = task.cost(system, tau, target)
+    cost = task.cost(system)
+    best = cost(*layout.split(tau), target)
     for scale in (1e-3, 1.0):
         inputs = layout.inputs(tau) + scale * rng.standard_normal((*tau.shape[:-1], task.horizon, system.input_dim))
-        other = layout.flatten(system.simulate(environment[:, : system.state_dim], inputs), inputs)
-        assert (task.cost(system, other, target) > best).all()
+        states = system.simulate(environment[:, : system.state_dim], inputs)
+        assert (cost(states, inputs, target) > best).all()
 
 
 def test_for_long_horizons_the_gain_is_that_of_dlqr(system):
@@ -221,7 +242,17 @@ def test_the_cost_ratio_is_1_at_the_optimum_and_more_elsewhere(system, rng):
         {"state_cost": (1.0, -1.0, 1.0, 1.0)},
         {"state_cost": (1.0, float("nan"), 1.0, 1.0)},
         {"state_cost": (0.0, 0.0, 0.0, 0.0)},
+        {"state_cost": [[1.0, 2.0], [2.0, 1.0]]},
+        {"state_cost": [[1.0, 2.0], [0.0, 1.0]]},
+        {"state_cost": [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]},
+        {"state_cost": [[1.0, 0.0], [0.0]]},
         {"input_cost": 0.0},
+        {"input_cost": [[1.0, 1.0], [1.0, 1.0]]},
+        {"terminal_cost": -1.0},
+        {"init_range": [1.0, [2.0, 1.0]]},
+        {"init_range": [1.0, [2.0]]},
+        {"target_range": [1.0, [0.0, float("nan")]]},
+        {"init_range": 0.0, "target_range": [0.0, [0.0, 0.0]]},
         {"input_cost": float("nan")},
         {"init_range": -1.0},
         {"target_range": float("inf")},
@@ -248,3 +279,57 @@ def test_draws_of_the_law_have_its_spread(scale):
     assert task.score(system, cases, plans, plans).per_plan["spread"].mean() == pytest.approx(scale**2, rel=0.05)
     single = plans[:, :1]
     assert "spread" not in task.score(system, cases, single, single).per_plan
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (
+            {"input_cost": [1.0, 2.0, 3.0]},
+            "input_cost has 3 entries, the system 2 inputs; give one",
+        ),
+        ({"terminal_cost": [[1.0]]}, "terminal_cost has 1 entries, the system 4 states"),
+        ({"init_range": [1.0]}, "init_range has 1 items, the system 4 states"),
+    ],
+)
+def test_sizes_that_are_not_the_systems_are_refused(options, message):
+    with pytest.raises(ConfigError, match=message):
+        LQR(**options).cases(double_integrator(), 1, numpy_generator(0, "test"))
+
+
+def test_starts_and_targets_fill_their_ranges():
+    task = LQR(init_range=[0.5, [-1.0, 3.0], 0.0, [2.0, 2.0]], target_range=[1.0, 2.0, 3.0, 4.0])
+    system = double_integrator()
+    E = task.condition(system).unpack(task.sample_environments(system, (4000,), numpy_generator(0, "test")))
+    np.testing.assert_allclose(E["x_init"].min(0), [-0.5, -1, 0, 2], atol=0.01)
+    np.testing.assert_allclose(E["x_init"].max(0), [0.5, 3, 0, 2], atol=0.01)
+    np.testing.assert_allclose(E["target"].max(0), [1, 2, 3, 4], atol=0.02)
+
+
+def test_demonstrations_along_begin_where_the_expert_passes():
+    """Without noise: from any of its states on, the optimum's value is what the expert's controller had left to do."""
+    system, task = double_integrator(process_noise=0.0), LQR(horizon=10, init_range=1.0)
+    drawn = task.sample_environments(system, (300,), numpy_generator(0, "test"))
+    E = task.condition(system).unpack(task.on_the_way(system, drawn, numpy_generator(1, "test")))
+    passed = system.layout(10).states(task.law(system).mean(drawn))
+    distance = np.linalg.norm(passed - E["x_init"][:, None], axis=-1)
+    assert distance.min(axis=1).max() < 1e-9
+    times = distance.argmin(axis=1)
+    assert np.bincount(times, minlength=11).min() > 0
+    np.testing.assert_array_equal(E["target"], task.condition(system).get(drawn, "target"))
+
+
+def test_a_data_set_begins_along_trajectories_where_it_is_asked_to():
+    system, task = double_integrator(), LQR(horizon=10)
+    made = [Generated(train_size=500, start_states=start) for start in ("drawn", "along")]
+    drawn, along_the_way = (task.condition(system).get(g.train(task, system).environment, "x_init") for g in made)
+    assert np.abs(drawn).max() <= 1
+    assert np.abs(along_the_way).max() > 2
+    assert made[0].determined_by("train") != made[1].determined_by("train")
+    assert made[0].determined_by("test") == made[1].determined_by("test")
+    fleet_task, family = Fleet(robots=2, horizon=10), DampedIntegrators()
+    assert fleet_task.demonstrations_along(family, 3, numpy_generator(0, "test")).trajectories.shape == (6, 64)
+    with pytest.raises(NotApplicableError, match="is for task=lqr and task=fleet, found Obstacles"):
+        made[1].train(Obstacles(), double_integrator(process_noise=0.0))
+    with pytest.raises(NotApplicableError, match="do not vary in time"):
+        made[1].train(task_for(AFFINE["time-varying"]), AFFINE["time-varying"])

@@ -5,12 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol, get_args, runtime_checkable
 
-from dadiff.errors import ConfigError
+from dadiff.errors import ConfigError, NotApplicableError
 from dadiff.randomness import numpy_generator
 from dadiff.systems import Family, System
 from dadiff.tasks import Cases, Demonstrations, Task
+from dadiff.tasks.task import Continuing
 
 Part = Literal["train", "test"]
+StartStates = Literal["drawn", "along"]
 PARTS: tuple[Part, ...] = get_args(Part)
 
 
@@ -38,11 +40,14 @@ class Generated:
     Args:
         train_size: number of demonstrations (a robot).
         test_size: number of test cases (a robot).
+        start_states: demonstrations begin at states that are `drawn`, or `along` trajectories of the expert, as a
+            plan does that is made again on the way.
         seed: of the environments and the process noise.
     """
 
     train_size: int = 10_000
     test_size: int = 100
+    start_states: StartStates = "drawn"
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -51,11 +56,24 @@ class Generated:
 
     def determined_by(self, part: Part) -> dict[str, Any]:
         """What the demonstrations or the cases depend on."""
-        return {"generated": self.train_size if part == "train" else self.test_size, "seed": self.seed}
+        if part == "test":
+            return {"generated": self.test_size, "seed": self.seed}
+        return {"generated": self.train_size, "start_states": self.start_states, "seed": self.seed}
 
     def train(self, task: Task, system: System | Family) -> Demonstrations:
-        """`train_size` demonstrations."""
-        return task.demonstrations(system, self.train_size, numpy_generator(self.seed, "demonstrations"))
+        """`train_size` demonstrations.
+
+        Raises:
+            NotApplicableError: if they should begin along trajectories, and the task knows of no such thing.
+        """
+        rng = numpy_generator(self.seed, "demonstrations")
+        if self.start_states == "drawn":
+            return task.demonstrations(system, self.train_size, rng)
+        if not isinstance(task, Continuing):
+            raise NotApplicableError(
+                f"dataset: start_states=along is for task=lqr and task=fleet, found {type(task).__name__}; use drawn"
+            )
+        return task.demonstrations_along(system, self.train_size, rng)
 
     def test(self, task: Task, system: System) -> Cases:
         """`test_size` cases."""

@@ -7,7 +7,7 @@ each robot solved by its own optimum. Every test robot is given the same cases.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -16,6 +16,7 @@ import numpy as np
 from dadiff.errors import ConfigError
 from dadiff.systems.families import LinearFamily, LinearRobots
 from dadiff.tasks.lqr import LQR, ends_layout
+from dadiff.tasks.quadratic import Range, Weight
 from dadiff.tasks.robots import ManyRobots, joined, scores_of
 from dadiff.tasks.task import Cases, Demonstrations, Scores, encoded
 from dadiff.trajectory import Layout
@@ -26,14 +27,15 @@ class Fleet(ManyRobots):
     """E = [x_init; x_target], followed by what the network is told of the robot; see `ManyRobots`.
 
     Args:
-        horizon, state_cost, input_cost, init_range, target_range: as for `LQR`, the same for all robots.
+        horizon, state_cost, input_cost, terminal_cost, init_range, target_range: as for `LQR`, the same for all robots.
     """
 
     horizon: int = 30
-    state_cost: Sequence[float] = (10.0, 10.0, 1.0, 1.0)
-    input_cost: float = 1.0
-    init_range: float = 1.0
-    target_range: float = 4.0
+    state_cost: Weight = (10.0, 10.0, 1.0, 1.0)
+    input_cost: Weight = 1.0
+    terminal_cost: Weight = 0.0
+    init_range: Range = 1.0
+    target_range: Range = 4.0
 
     def __post_init__(self) -> None:
         self.check_robots()
@@ -42,7 +44,8 @@ class Fleet(ManyRobots):
     @cached_property
     def lqr(self) -> LQR:
         """The task of each robot."""
-        return LQR(self.horizon, self.state_cost, self.input_cost, self.init_range, self.target_range)
+        costs = (self.state_cost, self.input_cost, self.terminal_cost)
+        return LQR(self.horizon, *costs, self.init_range, self.target_range)
 
     def target(self, system: LinearFamily) -> LinearRobots:
         """The test robots: those inside the ranges, then those outside.
@@ -67,8 +70,19 @@ class Fleet(ManyRobots):
 
     def demonstrations(self, system: LinearFamily, count: int, rng: np.random.Generator) -> Demonstrations:
         """`count` noisy runs of its expert for each training robot, each in an environment of its own."""
+        return self._demonstrations(system, count, rng, along=False)
+
+    def demonstrations_along(self, system: LinearFamily, count: int, rng: np.random.Generator) -> Demonstrations:
+        """As `demonstrations`, each from a state that the robot's expert passes on its way."""
+        return self._demonstrations(system, count, rng, along=True)
+
+    def _demonstrations(
+        self, system: LinearFamily, count: int, rng: np.random.Generator, *, along: bool
+    ) -> Demonstrations:
         robots = self.trained(system, rng)
         environment = self.lqr.sample_environments(robots, (*robots.robots, count), rng)
+        if along:
+            environment = self.lqr.on_the_way(robots, environment, rng)
         trajectories = self.lqr.realise(robots, environment, rng)
         condition = self.told(ends_layout(robots), environment, robots, count, rng)
         notes = {"robots": float(robots.robots[0]), "demonstrations a robot": float(count)}

@@ -2,16 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Literal
 
 import numpy as np
 
-from dadiff.errors import ConfigError
-from dadiff.experts.lqr import AffineFeedback, GaussianLaw, closed_loop_law, optimal_feedback, stationary_feedback
-from dadiff.systems import AffineSystem
+from dadiff.errors import ConfigError, NotApplicableError
+from dadiff.experts.lqr import (
+    AffineFeedback,
+    GaussianLaw,
+    closed_loop_law,
+    follow,
+    optimal_feedback,
+    stationary_feedback,
+)
+from dadiff.systems import AffineSystem, Family, TimeVarying, require_affine
+from dadiff.tasks.quadratic import (
+    QuadraticCost,
+    Range,
+    Weight,
+    check_range,
+    check_weight,
+    is_zero,
+    limits,
+    weight_matrix,
+)
 from dadiff.tasks.task import Cases, Demonstrations, Scores, encoded
 from dadiff.trajectory import Channel, Layout
 from dadiff.trajectory.response import along
@@ -19,7 +35,8 @@ from dadiff.trajectory.response import along
 
 def ends_layout(system: AffineSystem) -> Layout:
     """[x_init; target], each (n,): what the expert needs to know."""
-    return Layout((Channel("x_init", system.state_dim), Channel("target", system.state_dim)))
+    n, names, units = system.state_dim, system.state_names, system.state_units
+    return Layout(tuple(Channel(name, n, labels=names, units=units) for name in ("x_init", "target")))
 
 
 @dataclass(frozen=True)
@@ -28,9 +45,10 @@ class LQR:
 
     Args:
         horizon: T.
-        state_cost: diagonal of Q, (n,).
-        input_cost: R = input_cost * I.
-        init_range: a, in the units of the state.
+        state_cost: Q, as one weight for all states, one for each (its diagonal), or the rows of (n, n).
+        input_cost: R, likewise for the inputs.
+        terminal_cost: Q_T of x(T), likewise; 0 as in the paper.
+        init_range: a, in the units of the state; one for all states, or one item for each: a, or [low, high].
         target_range: b, likewise.
         expert: `optimal` is the finite-horizon affine optimum, `stationary` the infinite-horizon gain.
         reference: a test case's reference is the controller's trajectory without process noise (`mean`), or
@@ -38,41 +56,48 @@ class LQR:
     """
 
     horizon: int = 30
-    state_cost: Sequence[float] = (10.0, 10.0, 1.0, 1.0)
-    input_cost: float = 1.0
-    init_range: float = 1.0
-    target_range: float = 4.0
+    state_cost: Weight = (10.0, 10.0, 1.0, 1.0)
+    input_cost: Weight = 1.0
+    terminal_cost: Weight = 0.0
+    init_range: Range = 1.0
+    target_range: Range = 4.0
     expert: Literal["optimal", "stationary"] = "optimal"
     reference: Literal["mean", "realised"] = "mean"
 
     def __post_init__(self) -> None:
         if self.horizon < 1:
             raise ConfigError(f"task: horizon is {self.horizon}; it must be at least 1")
-        if not (all(0 <= q < np.inf for q in self.state_cost) and 0 < self.input_cost < np.inf):
-            raise ConfigError(
-                f"task: state_cost is {list(self.state_cost)} and input_cost {self.input_cost}; "
-                "Q must not be negative, R must be positive, and both finite"
-            )
+        for name, positive in (("state_cost", False), ("input_cost", True), ("terminal_cost", False)):
+            check_weight(getattr(self, name), name, positive=positive)
         for name in ("init_range", "target_range"):
-            if not 0 <= (value := getattr(self, name)) < np.inf:
-                raise ConfigError(f"task: {name} is {value}; it must be finite and not negative")
-        if self.state_cost and not any(self.state_cost):
+            check_range(getattr(self, name), name)
+        if self.state_cost != () and is_zero(self.state_cost) and is_zero(self.terminal_cost):
             raise ConfigError("task: state_cost is 0 for every state, so every optimum costs nothing; raise one")
-        if self.init_range == self.target_range == 0:
+        if is_zero(self.init_range) and is_zero(self.target_range):
             raise ConfigError("task: init_range and target_range are both 0, so every optimum costs nothing; widen one")
 
-    @cached_property
-    def Q(self) -> np.ndarray:
-        """(n, n)."""
-        return np.diag(np.asarray(self.state_cost, dtype=np.float64))
+    def cost(self, system: AffineSystem) -> QuadraticCost:
+        """What a trajectory costs.
 
-    def R(self, system: AffineSystem) -> np.ndarray:
-        """(m, m)."""
-        return self.input_cost * np.eye(system.input_dim)
+        Raises:
+            ConfigError: if a weight has another size than the system has states or inputs.
+        """
+        n, m = system.state_dim, system.input_dim
+        return QuadraticCost(
+            weight_matrix(self.state_cost, n, "state_cost", "states"),
+            weight_matrix(self.input_cost, m, "input_cost", "inputs"),
+            weight_matrix(self.terminal_cost, n, "terminal_cost", "states"),
+        )
 
     def target(self, system: AffineSystem) -> AffineSystem:
-        """The system itself."""
-        return system
+        """The system itself.
+
+        Raises:
+            ConfigError: if it is not linear.
+        """
+        if isinstance(system, Family):  # of which the caller says that it needs another task
+            return system
+        return require_affine(system, "task: the LQR expert")
 
     def condition(self, system: AffineSystem) -> Layout:
         """E = [x_init; target], each (n,)."""
@@ -83,18 +108,11 @@ class LQR:
         return encoded(self.condition(system), given)
 
     def feedback(self, system: AffineSystem) -> AffineFeedback:
-        """The expert's controller.
-
-        Raises:
-            ConfigError: if state_cost has another length than the system has states.
-        """
-        if len(self.state_cost) != system.state_dim:
-            raise ConfigError(
-                f"task: state_cost has {len(self.state_cost)} entries, the system {system.state_dim} states; "
-                "give one weight a state"
-            )
-        solve = {"optimal": optimal_feedback, "stationary": stationary_feedback}[self.expert]
-        return solve(system, self.Q, self.R(system), self.horizon)
+        """The expert's controller."""
+        cost = self.cost(system)
+        if self.expert == "stationary":
+            return stationary_feedback(system, cost.Q, cost.R, self.horizon)
+        return optimal_feedback(system, cost.Q, cost.R, self.horizon, cost.terminal)
 
     def law(self, system: AffineSystem) -> GaussianLaw:
         """The Gaussian law of demonstrations given E."""
@@ -102,13 +120,34 @@ class LQR:
 
     def sample_environments(self, system: AffineSystem, shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
         """E of shape (*shape, 2n)."""
-        ranges = np.repeat([self.init_range, self.target_range], system.state_dim)
-        return rng.uniform(-ranges, ranges, size=(*shape, 2 * system.state_dim))
+        n = system.state_dim
+        start, target = limits(self.init_range, n, "init_range"), limits(self.target_range, n, "target_range")
+        low, high = (np.concatenate(ends) for ends in zip(start, target, strict=True))
+        return rng.uniform(low, high, size=(*shape, 2 * n))
 
     def demonstrations(self, system: AffineSystem, count: int, rng: np.random.Generator) -> Demonstrations:
         """`count` noisy runs of the expert, each in an environment of its own."""
         environment = self.sample_environments(system, (count,), rng)
         return Demonstrations(self.realise(system, environment, rng), environment)
+
+    def demonstrations_along(self, system: AffineSystem, count: int, rng: np.random.Generator) -> Demonstrations:
+        """As `demonstrations`, each from a state that the expert passes on its way."""
+        environment = self.on_the_way(system, self.sample_environments(system, (count,), rng), rng)
+        return Demonstrations(self.realise(system, environment, rng), environment)
+
+    def on_the_way(self, system: AffineSystem, environment: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """E (*robots, ..., 2n) with x_init at a time drawn from 0..T of a noisy run of the expert.
+
+        Raises:
+            NotApplicableError: if the system varies in time, for which another start is another problem.
+        """
+        if isinstance(system, TimeVarying):
+            raise NotApplicableError("dataset: start_states=along is for systems that do not vary in time; use drawn")
+        states = system.layout(self.horizon).states(self.realise(system, environment, rng))
+        times = rng.integers(0, self.horizon + 1, size=environment.shape[:-1])
+        passed = np.take_along_axis(states, times[..., None, None], axis=-2)[..., 0, :]
+        ends = ends_layout(system)
+        return ends.pack(x_init=passed, target=ends.get(environment, "target"))
 
     def cases(self, system: AffineSystem, count: int, rng: np.random.Generator) -> Cases:
         """`count` cases for each robot of the system."""
@@ -125,23 +164,16 @@ class LQR:
         noise = rng.standard_normal((*environment.shape[:-1], law.noise_map.shape[-1]))
         return law.mean(environment) + along(law.noise_map, noise)
 
-    def cost(self, system: AffineSystem, tau: np.ndarray, target: np.ndarray) -> np.ndarray:
-        """sum_t |x(t) - x_target|_Q^2 + |u(t)|_R^2 of trajectories (..., d) and targets (..., n)."""
-        states, inputs = system.layout(self.horizon).split(tau)
-        deviation = states[..., :-1, :] - target[..., None, :]
-        return (deviation**2 @ np.diag(self.Q)).sum(-1) + self.input_cost * (inputs**2).sum((-2, -1))
-
     def score(self, system: AffineSystem, cases: Cases, planned: np.ndarray, rollout: np.ndarray) -> Scores:
         """The cost after replay over that of the noise-free finite-horizon optimum; and how widely plans are spread.
 
         Spread is the trace of the covariance of a case's plans over that of the law of optimal trajectories, 1 for
         right samples: each plan's squared distance from their mean, S / (S - 1) times, over the trace.
         """
-        target = cases.get("target")
-        feedback = optimal_feedback(system, self.Q, self.R(system), self.horizon)
-        ends = ends_layout(system).pack(x_init=cases.x_init, target=target)
-        optimum = closed_loop_law(system, feedback).mean(ends)
-        ratio = self.cost(system, rollout, target[..., None, :]) / self.cost(system, optimum, target)[..., None]
+        cost, target, layout = self.cost(system), cases.get("target"), system.layout(self.horizon)
+        feedback = optimal_feedback(system, cost.Q, cost.R, self.horizon, cost.terminal)
+        optimum = follow(system, feedback, cases.x_init, target)
+        ratio = cost(*layout.split(rollout), target[..., None, :]) / cost(*layout.split(optimum), target)[..., None]
         return Scores(per_plan={"cost_ratio": ratio, **self._spread(system, planned)})
 
     def _spread(self, system: AffineSystem, planned: np.ndarray) -> dict[str, np.ndarray]:

@@ -156,6 +156,15 @@ class Lawful(Protocol):
 
 
 @runtime_checkable
+class Continuing(Protocol):
+    """A task whose expert can begin anywhere on its way: what a closed loop meets."""
+
+    def demonstrations_along(self, system: System | Family, count: int, rng: np.random.Generator) -> Demonstrations:
+        """As `Task.demonstrations`, each from a state that the expert passes on its way."""
+        ...
+
+
+@runtime_checkable
 class Augmenting(Protocol):
     """A task that knows changes of E which leave the optimum as it is."""
 
