@@ -21,6 +21,7 @@ PROTOCOLS: Mapping[str, tuple[str, ...]] = {
     "dataset": ("dadiff.datasets.generated.Dataset",),
     "recording": ("dadiff.systems.recording.Recorder",),
     "schedule": ("dadiff.diffusion.schedule.Schedule",),
+    "encoding": ("dadiff.tasks.encodings.Encoding",),
     "denoiser": ("dadiff.denoisers.recipes.Recipe", "dadiff.denoisers.recipes.ExactRecipe"),
     "training": ("dadiff.denoisers.training.Training",),
     "sampler": ("dadiff.diffusion.samplers.Sampler",),

@@ -16,6 +16,7 @@ GROUPS = (
     "dataset",
     "recording",
     "schedule",
+    "encoding",
     "denoiser",
     "training",
     "sampler",

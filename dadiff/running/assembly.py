@@ -8,6 +8,8 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from dadiff.behaviours import TrajectorySet
 from dadiff.datasets.cached import load_data, save_data
 from dadiff.denoisers.recipes import ExactRecipe, Recipe
@@ -20,11 +22,13 @@ from dadiff.running.parts import Parts
 from dadiff.store import Cache, Results
 from dadiff.systems import System
 from dadiff.tasks import Cases, Demonstrations
+from dadiff.tasks.encodings import Encoder
 from dadiff.tasks.task import Augmenting, Lawful
 from dadiff.trajectory.coordinates import Coordinates, physical, standardised
 from dadiff.trajectory.layout import Layout, TrajectoryLayout
 
 if TYPE_CHECKING:
+    from dadiff.denoisers.encoded import EncodedDenoiser
     from dadiff.denoisers.learned import NetworkDenoiser
 
 
@@ -95,11 +99,30 @@ class Experiment:
         return self.parts.task.condition(self.target)
 
     @cached_property
+    def encoder(self) -> Encoder | None:
+        """Of E, for a trained denoiser that is told something else than E."""
+        return self.parts.encoding.encoder(self.parts.task, self.target) if self.parts.denoiser.trainable else None
+
+    @property
+    def _told(self) -> Layout:
+        """Of what a network is told."""
+        return self.encoder.layout if self.encoder else self.condition
+
+    @cached_property
+    def _learned(self) -> tuple[np.ndarray, np.ndarray]:
+        """What a network is told (N, f), and the trajectories, or differences to references, that it learns (N, d)."""
+        environment, trajectories = self.demonstrations.environment, self.demonstrations.trajectories
+        if self.encoder is None:
+            return environment, trajectories
+        features, reference = self.encoder.encode(environment)
+        return features, trajectories - reference
+
+    @cached_property
     def coordinates(self) -> Coordinates:
-        """Where diffusion and projection act."""
+        """Where diffusion and projection act; standardised by what the network predicts."""
         if self.parts.settings.coordinates == "physical":
             return physical(self.layout)
-        return standardised(self.layout, self.demonstrations.trajectories)
+        return standardised(self.layout, self._learned[1])
 
     @cached_property
     def device(self) -> str:
@@ -187,29 +210,31 @@ class Experiment:
     def _cached(self, artefact: Artefact, build: Callable[[Path], None], *, resumable: bool = False) -> Path:
         return self.cache.get_or_build(artefact.kind, artefact.key, artefact.determined_by, build, resumable=resumable)
 
-    def _trained(self, recipe: Recipe) -> NetworkDenoiser:
+    def _trained(self, recipe: Recipe) -> NetworkDenoiser | EncodedDenoiser:
         from dadiff.denoisers.checkpoints import load
+        from dadiff.denoisers.encoded import EncodedDenoiser
 
         if self.identity.denoiser is None:
             raise ConfigError("denoiser: it is neither trainable nor exact; see Recipe and ExactRecipe")
         folder = self._cached(self.identity.denoiser, partial(self._train, recipe), resumable=True)
-        file = folder / "model.safetensors"
-        return load(file, recipe, self.layout, self.condition, self.parts.schedule).to(self.device)
+        file, schedule = folder / "model.safetensors", self.parts.schedule
+        network = load(file, recipe, self.layout, self._told, schedule).to(self.device)
+        return EncodedDenoiser(network, self.encoder, self.coordinates, schedule) if self.encoder else network
 
     def _train(self, recipe: Recipe, folder: Path) -> None:
         from dadiff.denoisers.learning import train
 
-        task, demonstrations = self.parts.task, self.demonstrations
+        task, (told, learned) = self.parts.task, self._learned
         train(
             recipe,
             self.layout,
-            self.condition,
+            self._told,
             self.parts.schedule,
             self.parts.training,
-            self.coordinates.to_scaled(demonstrations.trajectories),
-            demonstrations.environment,
+            learned / self.coordinates.scale if self.encoder else self.coordinates.to_scaled(learned),
+            told,
             folder,
             device=self.device,
-            augment=task.augment if isinstance(task, Augmenting) else None,
+            augment=task.augment if isinstance(task, Augmenting) and not self.encoder else None,
             progress=self.parts.settings.progress,
         )

@@ -20,6 +20,7 @@ from dadiff.config.build import TARGET, defaults, resolve
 from dadiff.datasets.files import FromFiles
 from dadiff.datasets.generated import PARTS, Dataset
 from dadiff.running.parts import Parts
+from dadiff.tasks.encodings import Plain
 
 FORMAT = 2  # raised whenever a change moves results; see CHANGELOG
 
@@ -97,7 +98,8 @@ def identity_of(parts: Parts) -> Identity:
     demonstrations = Artefact("demonstrations", expert | {"dataset": nodes["dataset"]["train"]})
     cases = Artefact("cases", expert | {"dataset": nodes["dataset"]["test"]})
     trained = {"demonstrations": demonstrations.key, "coordinates": coordinates}
-    denoiser = Artefact("denoiser", trained | {g: nodes[g] for g in ("schedule", "denoiser", "training")})
+    learning = [group for group in ("schedule", "encoding", "denoiser", "training") if group in matters]
+    denoiser = Artefact("denoiser", trained | {g: nodes[g] for g in learning})
     recording = Artefact("recording", expert | {"recording": nodes["recording"]})
     determined_by = {"format": FORMAT, "coordinates": coordinates, **{g: nodes[g] for g in matters}}
     choices = {g: parts.settings.choices.get(g, nodes[g][TARGET].rpartition(".")[2].lower()) for g in matters}
@@ -115,7 +117,9 @@ def identity_of(parts: Parts) -> Identity:
 def _groups_that_matter(parts: Parts) -> list[str]:
     ignored = {"tracking"}
     if not parts.denoiser.trainable:
-        ignored.add("training")
+        ignored |= {"training", "encoding"}
+    if isinstance(parts.encoding, Plain):
+        ignored.add("encoding")
     if "recording" not in parts.projector.needs:
         ignored.add("recording")
     if isinstance(parts.projector, NoProjector):
@@ -147,7 +151,8 @@ def _name(choices: Mapping[str, str], nodes: Mapping[str, Mapping[str, Any]], pa
         recording = nodes["recording"]
         words += [f"S={recording['length']}", f"w={recording['process_noise']}"]
         words += [f"recording={recording['seed']}"] if recording["seed"] != parts.settings.seed else []
-    words += [_word(group, choices, nodes) for group in ("enforcement", "denoiser", "sampler") if group in choices]
+    others = ("enforcement", "encoding", "denoiser", "sampler")
+    words += [_word(group, choices, nodes) for group in others if group in choices]
     return "/".join([*words, f"seed={parts.settings.seed}"])
 
 

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from dadiff.systems import Family, System
     from dadiff.systems.recording import Recorder
     from dadiff.tasks import Task
+    from dadiff.tasks.encodings import Encoding
     from dadiff.tracking import Tracking
 
 
@@ -39,6 +40,7 @@ class Parts:
     dataset: Dataset
     recording: Recorder
     schedule: Schedule
+    encoding: Encoding
     denoiser: Recipe | ExactRecipe
     training: Training
     sampler: Sampler

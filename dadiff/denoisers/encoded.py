@@ -1,0 +1,60 @@
+"""`EncodedDenoiser`: a network that is told features of E and predicts the difference to a reference that E determines.
+
+The chain, its coordinates and its projections see an ordinary denoiser of tau.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dadiff.denoisers.learned import NetworkDenoiser
+from dadiff.diffusion.schedule import Schedule
+from dadiff.trajectory.coordinates import Coordinates
+
+
+class Encoder(Protocol):
+    """What is asked of `dadiff.tasks.encodings.Encoder`."""
+
+    def encode(self, environment: np.ndarray) -> tuple[np.ndarray, np.ndarray]: ...
+
+
+class _Seen(NamedTuple):
+    environment: Tensor
+    features: Tensor
+    reference: Tensor
+
+
+class EncodedDenoiser:
+    """With r = reference(E) in the sampler's coordinates, tau_i - sqrt(alpha_bar_i) r is tau_0 - r noised alike, so
+
+        tau0_hat = r + network(tau_i - sqrt(alpha_bar_i) r, i, features(E))
+
+    whatever the network predicts.
+
+    Args:
+        network: trained on tau_0 - r and features.
+    """
+
+    def __init__(
+        self, network: NetworkDenoiser, encoder: Encoder, coordinates: Coordinates, schedule: Schedule
+    ) -> None:
+        self.network, self.encoder, self.coordinates = network, encoder, coordinates
+        self.signal = np.sqrt(schedule.alpha_bar)
+        self._last: _Seen | None = None
+
+    @torch.inference_mode()
+    def __call__(self, tau: Tensor, i: int, environment: Tensor) -> Tensor:
+        """tau0_hat (..., d) from tau (..., d), i in 1..L and E (..., c) in physical units."""
+        if self._last is None or self._last.environment is not environment:  # a chain asks for the same one each step
+            self._last = self._look(environment)
+        _, features, reference = self._last
+        return reference + self.network(tau - float(self.signal[i]) * reference, i, features)
+
+    def _look(self, environment: Tensor) -> _Seen:
+        features, reference = self.encoder.encode(environment.flatten(0, -2).cpu().numpy().astype(float))
+        parts = (features, self.coordinates.to_scaled(reference))
+        return _Seen(environment, *(environment.new_tensor(a).unflatten(0, environment.shape[:-1]) for a in parts))
