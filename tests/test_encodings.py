@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
 import numpy as np
@@ -15,12 +14,13 @@ from dadiff.denoisers.encoded import EncodedDenoiser
 from dadiff.diffusion.schedule import cosine
 from dadiff.errors import ConfigError
 from dadiff.evaluation.errors import dynamics_residual
+from dadiff.planning import Planner
 from dadiff.running.assembly import Experiment
 from dadiff.running.experiment import execute
 from dadiff.running.identity import identify
 from dadiff.systems import double_integrator
 from dadiff.tasks import LQR, Cases
-from dadiff.tasks.encodings import Encoder, PathFrame, PathFrameEncoder
+from dadiff.tasks.encodings import Encoder, PathFrame
 from dadiff.tasks.obstacles import Obstacles
 from dadiff.trajectory.coordinates import standardised
 
@@ -100,14 +100,6 @@ def test_depth_is_how_far_the_path_enters_inflated_discs(cases: Cases) -> None:
     np.testing.assert_allclose(encoder.layout.get(features, "depth")[..., 0], depth.sum(axis=2), atol=1e-12)
 
 
-@every_encoder
-def test_a_stored_description_gives_the_encoder_back(encoder: PathFrameEncoder, cases: Cases) -> None:
-    restored = type(encoder).restored(json.loads(json.dumps(encoder.description)))
-    assert restored.layout == encoder.layout
-    for mine, other in zip(restored.encode(cases.environment), encoder.encode(cases.environment), strict=True):
-        np.testing.assert_array_equal(mine, other)
-
-
 def test_what_path_frame_cannot_do_is_said() -> None:
     with pytest.raises(ConfigError, match="task LQR has no obstacle-free optimum; use task=obstacles"):
         PathFrame().encoder(LQR(), double_integrator())
@@ -122,6 +114,7 @@ class Echo:
     """Stands for a network: gives back what it is asked with, and counts."""
 
     def __init__(self) -> None:
+        self.made_from = None
         self.asked: list[tuple[Tensor, int, Tensor]] = []
 
     def __call__(self, tau: Tensor, i: int, environment: Tensor) -> Tensor:
@@ -167,16 +160,16 @@ SMALL = (
 
 
 def test_a_short_training_already_beats_the_obstacle_free_optimum(tmp_path) -> None:
-    """A real run; and the same model asked for new environments, without its data set."""
+    """A real run; and the same model in a file, asked for new environments without its data set."""
     experiment = Experiment.of(composed(*SMALL, f"output_dir={tmp_path}"))
     stored = execute(experiment)
     _, free = experiment.encoder.encode(experiment.cases.environment)
     error = np.square(LAYOUT.states(free - experiment.cases.reference)).sum(axis=-1).mean()
     assert stored.metrics["planned_state_error"] < 0.8 * error
     fresh = TASK.cases(SYSTEM, 3, np.random.default_rng(9))
-    E = torch.tensor(fresh.environment)
-    plan = experiment.denoiser(torch.zeros(3, LAYOUT.size, dtype=torch.float64), 1000, E)
-    assert plan.shape == (3, LAYOUT.size)
+    plans = experiment.planner.plan(fresh.environment, seed=1)
+    stored_planner = Planner.load(experiment.planner.save(tmp_path / "planner.zip"))
+    np.testing.assert_array_equal(stored_planner.plan(fresh.environment, seed=1).tau, plans.tau)
 
 
 def test_encoding_is_part_of_what_is_trained_and_not_of_the_data() -> None:

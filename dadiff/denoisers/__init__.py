@@ -4,6 +4,7 @@
     prediction.py   what a network predicts (clean, noise, velocity) and how the clean estimate follows
     networks.py     the networks
     learned.py      `NetworkDenoiser`: network, prediction, scaling of E; the casts between float64 and float32
+    encoded.py      `EncodedDenoiser`: a network that is told features of E and predicts the difference to a reference
     exact.py        `ExactDenoiser`: the posterior mean of a Gaussian law
     training.py     `Training`: the component; light, without torch
     learning.py     `train`: the loop, its interruption and resumption

@@ -5,13 +5,14 @@ The chain, its coordinates and its projections see an ordinary denoiser of tau.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from dadiff.denoisers.learned import NetworkDenoiser
+from dadiff.denoisers.learned import NetworkDenoiser, NetworkParts
 from dadiff.diffusion.schedule import Schedule
 from dadiff.trajectory.coordinates import Coordinates
 
@@ -20,6 +21,20 @@ class Encoder(Protocol):
     """What is asked of `dadiff.tasks.encodings.Encoder`."""
 
     def encode(self, environment: np.ndarray) -> tuple[np.ndarray, np.ndarray]: ...
+
+
+@dataclass(frozen=True)
+class EncodedParts:
+    """What an encoded denoiser is made of, besides weights: enough to build one that they fit into."""
+
+    network: NetworkParts
+    encoder: Encoder
+    coordinates: Coordinates
+    schedule: Schedule
+
+    def build(self, device: str = "cpu") -> EncodedDenoiser:
+        """The denoiser, its weights yet to be filled in."""
+        return EncodedDenoiser(self.network.build(device), self.encoder, self.coordinates, self.schedule)
 
 
 class _Seen(NamedTuple):
@@ -43,6 +58,7 @@ class EncodedDenoiser:
         self, network: NetworkDenoiser, encoder: Encoder, coordinates: Coordinates, schedule: Schedule
     ) -> None:
         self.network, self.encoder, self.coordinates = network, encoder, coordinates
+        self.made_from = EncodedParts(network.made_from, encoder, coordinates, schedule)
         self.signal = np.sqrt(schedule.alpha_bar)
         self._last: _Seen | None = None
 
@@ -58,3 +74,7 @@ class EncodedDenoiser:
         features, reference = self.encoder.encode(environment.flatten(0, -2).cpu().numpy().astype(float))
         parts = (features, self.coordinates.to_scaled(reference))
         return _Seen(environment, *(environment.new_tensor(a).unflatten(0, environment.shape[:-1]) for a in parts))
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """The network's."""
+        return self.network.state_dict()

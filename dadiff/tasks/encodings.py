@@ -8,7 +8,6 @@ An `Encoding` is the component that `conf/encoding/*.yaml` names; an `Encoder` i
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol
@@ -25,16 +24,11 @@ from dadiff.trajectory.layout import Channel, Layout, TrajectoryLayout
 
 
 class Encoder(Protocol):
-    """Features of E and a reference that follow from E alone."""
+    """Features of E and a reference that follow from E alone. A frozen dataclass, stored with what is trained."""
 
     @property
     def layout(self) -> Layout:
         """Of the features."""
-        ...
-
-    @property
-    def description(self) -> Mapping[str, float]:
-        """Numbers that determine the encoder, for files that hold what was trained with it."""
         ...
 
     def encode(self, environment: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -113,18 +107,6 @@ class PathFrameEncoder:
         told = tuple(self.task.condition().channel(name) for name in ("x_init", "target", "waypoints"))
         seen = (("path", 2), ("near", 1), ("near_normal", 2), ("depth", 1), ("depth_normal", 2))
         return Layout((*told, *(Channel(name, dim, 2, T) for name, dim in seen)))
-
-    @property
-    def description(self) -> dict[str, float]:
-        """As `restored` takes it."""
-        names = ("horizon", "max_waypoints", "max_obstacles", "margin", "waypoint_weight", "input_cost")
-        return {name: getattr(self.task, name) for name in names} | {"time_step": self.time_step, "reach": self.reach}
-
-    @classmethod
-    def restored(cls, description: Mapping[str, float]) -> PathFrameEncoder:
-        """The encoder of a stored description."""
-        task = {name: value for name, value in description.items() if name not in ("time_step", "reach")}
-        return cls(Obstacles(waypoint_times=(), **task), description["time_step"], description["reach"])  # type: ignore[arg-type]
 
     def encode(self, environment: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Features (N, f) and the obstacle-free optima (N, d) of E (N, c)."""
