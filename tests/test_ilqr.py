@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from dadiff.behaviours.stages import stages_of
 from dadiff.errors import ConfigError
 from dadiff.experts.ilqr import Metric, Tracking, costates, gauss_newton, solve
 from dadiff.systems import Linear
 from dadiff.systems.nonlinear import Nonlinear
 from dadiff.systems.quadrotors import GRAVITY, PlanarQuadrotor
-from dadiff.trajectory.response import dynamics_matrix
 
 HORIZON = 12
 
@@ -49,7 +49,7 @@ def test_on_linear_systems_one_sweep_is_the_projection(directions, pins, free, r
     values = rng.standard_normal((plans, n))
     problem = Tracking(system, weights, reference, None if free else x_init, (where, values) if pins else None)
     found = solve(problem, sweeps=1).tau
-    rows, right = [dynamics_matrix(*Linear(A, B).matrices(T)[:2])], [np.zeros((plans, n * T))]
+    rows, right = [stages_of(Linear(A, B), T).matrix(layout)[0]], [np.zeros((plans, n * T))]
     if not free:
         rows, right = [*rows, np.eye(layout.size)[layout.initial_state]], [*right, x_init]
     if pins:

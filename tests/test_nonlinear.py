@@ -25,7 +25,7 @@ def points(system, rng, shape=(5, 4)):
 def test_the_jacobian_agrees_with_differences(system, rng):
     x, u = points(system, rng)
     robots = system.robots[0] if system.robots else None
-    differences = Simulated(system.step, system.state_dim, system.input_dim, num_robots=robots)
+    differences = Simulated(system.step, system.state_dim, system.input_dim, robots=robots)
     for found, expected in zip(system.linearise(x, u), differences.linearise(x, u), strict=True):
         np.testing.assert_allclose(found, expected, atol=2e-8)
 
@@ -46,7 +46,7 @@ def test_torch_functions_are_differentiated(rng):
         accelerations[1] = accelerations[1] - c * x[..., 4]
         return torch.stack([x[..., 3], x[..., 4], x[..., 5], *accelerations, 0.7 * u[..., 1]], -1)
 
-    found = Nonlinear(rate, 6, 2, integrator="rk4", time_step=0.05, num_robots=2)
+    found = Nonlinear(rate, 6, 2, integrator="rk4", time_step=0.05, robots=2)
     expected = PlanarQuadrotor(thrust_gain=np.array([0.5, 1.5]), torque_gain=np.full(2, 0.7), drag=np.full(2, 0.3))
     x, u = points(expected, rng, (4,))
     np.testing.assert_allclose(found.step(x, u), expected.step(x, u), atol=1e-14)

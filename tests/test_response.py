@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from laws import fleet, members, tolerance, varying_system
 
-from dadiff.trajectory.response import along, dynamics_matrix, forced_response, free_response
+from dadiff.behaviours.stages import stages_of
+from dadiff.trajectory.response import along, forced_response, free_response
 
 HORIZON = 7
 
@@ -25,9 +26,9 @@ def test_the_trajectory_map_and_the_offset_are_the_roll_out(affine, rng, horizon
 def test_the_dynamics_matrix_gives_the_offset(affine, rng):
     """G tau = [c_0; ...; c_{T-1}] of every roll-out, and of nothing else: it has full row rank."""
     x_init, inputs = rng.standard_normal(affine.state_dim), rng.standard_normal((HORIZON, affine.input_dim))
-    A, B, c = affine.matrices(HORIZON)
-    G, tau = dynamics_matrix(A, B), affine.layout(HORIZON).flatten(affine.simulate(x_init, inputs), inputs)
-    np.testing.assert_allclose(G @ tau, c.ravel(), atol=1e-12)
+    layout = affine.layout(HORIZON)
+    G, g = stages_of(affine, HORIZON).matrix(layout)
+    np.testing.assert_allclose(G @ layout.flatten(affine.simulate(x_init, inputs), inputs), g, atol=1e-12)
     assert np.linalg.matrix_rank(G) == len(G) == HORIZON * affine.state_dim
 
 

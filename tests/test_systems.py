@@ -132,7 +132,7 @@ class TestShippedSystems:
         system = shipped_system(preset)
         x, u = self.points(system, rng)
         u, robots = u[..., 0, :], system.robots[0] if system.robots else None
-        difference = Simulated(system.step, system.state_dim, system.input_dim, num_robots=robots)
+        difference = Simulated(system.step, system.state_dim, system.input_dim, robots=robots)
         for found, expected in zip(system.linearise(x, u), difference.linearise(x, u), strict=True):
             np.testing.assert_allclose(found, expected, atol=1e-7)
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from dadiff.errors import ConfigError, ShapeError
-from dadiff.systems.system import System, Times
+from dadiff.systems.system import System, Times, robots_of
 from dadiff.trajectory.response import along, beside, simulate, trajectory_map
 
 
@@ -37,8 +37,7 @@ class AffineSystem(System):
     def __post_init__(self) -> None:
         A, B = stacked(self.A, "A"), stacked(self.B, "B")
         c = np.zeros(A.shape[:-1]) if self.c is None else stacked(self.c, "c")
-        robots = () if self.robots is None else tuple(np.atleast_1d(np.asarray(self.robots, dtype=int)).tolist())
-        for name, value in (("A", A), ("B", B), ("c", c), ("robots", robots)):
+        for name, value in (("A", A), ("B", B), ("c", c), ("robots", robots_of(self.robots))):
             object.__setattr__(self, name, value)
         self._check_dimensions()
         if A.shape[-1:] != A.shape[-2:-1] or B.shape[:-1] != A.shape[:-1] or c.shape != A.shape[:-1]:

@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from dadiff.errors import ConfigError, ShapeError
-from dadiff.systems.system import System, Times
+from dadiff.systems.system import System, Times, robots_of
 
 Integrator = Literal["none", "euler", "rk4"]
 Function = Callable[[Any, Any], Any]
@@ -98,7 +98,7 @@ class _Given(System):
     function: Function = field(repr=False)
     states: int
     inputs: int
-    num_robots: int | None = field(default=None, kw_only=True)
+    robots: tuple[int, ...] = field(default=(), kw_only=True)
 
     @property
     def state_dim(self) -> int:
@@ -110,13 +110,9 @@ class _Given(System):
         """m."""
         return self.inputs
 
-    @property
-    def robots(self) -> tuple[int, ...]:
-        """(R,), or () for a single system."""
-        return () if self.num_robots is None else (self.num_robots,)
-
     def _check_function(self) -> None:
         """Raise unless the function gives (*robots, ..., n) for a batch of zeros."""
+        object.__setattr__(self, "robots", robots_of(self.robots))
         self.check()
         x, u = np.zeros((*self.robots, 3, self.states)), np.zeros((*self.robots, 3, self.inputs))
         if (found := self.step(x, u).shape) != x.shape:
@@ -136,7 +132,7 @@ class Nonlinear(_Given):
         states, inputs: n and m.
         integrator: `none` where f is the step itself; `rk4` or `euler` where it is dx/dt (then time_step is needed).
         jacobian: (x, u) -> (df/dx, df/du) of the *step*, in numpy; None differentiates f with torch's forward mode.
-        num_robots: R where arrays have a first dimension of R robots.
+        robots: R where arrays have a first dimension of R robots.
 
     Example:
         >>> pendulum = Nonlinear(lambda x, u: torch.stack([x[..., 1], u[..., 0] - torch.sin(x[..., 0])], -1),
@@ -198,7 +194,7 @@ class Simulated(_Given):
         function: f in numpy, on batches: (*robots, ..., n), (*robots, ..., m) -> (*robots, ..., n).
         states, inputs: n and m.
         difference: step of the differences, relative to max(1, |entry|).
-        num_robots: as for `Nonlinear`.
+        robots: as for `Nonlinear`.
     """
 
     difference: float = field(default=1e-6, kw_only=True)

@@ -84,6 +84,11 @@ def _spread(value: float | np.ndarray, size: int, name: str) -> np.ndarray:
     return np.broadcast_to(array, size)
 
 
+def robots_of(given: int | Sequence[int] | None) -> tuple[int, ...]:
+    """(R,) from R or (R,), () from None or ()."""
+    return () if given is None else tuple(np.atleast_1d(np.asarray(given, dtype=int)).tolist())
+
+
 @dataclass(frozen=True, kw_only=True)
 class System(ABC):
     """One system, or a fleet of them. Subclasses give the sizes, a step and its linearisation.

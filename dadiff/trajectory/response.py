@@ -51,18 +51,6 @@ def trajectory_map(A: np.ndarray, B: np.ndarray) -> np.ndarray:
     return F
 
 
-def dynamics_matrix(A: np.ndarray, B: np.ndarray) -> np.ndarray:
-    """G of shape (..., nT, d) with G tau = [x(t+1) - A_t x(t) - B_t u(t)] for t = 0..T-1.
-
-    im F is its kernel. G holds no products of A, so that the kernel is found well however fast they grow.
-    """
-    layout = layout_of(A, B)
-    unit = np.broadcast_to(np.eye(layout.size), (*A.shape[:-3], layout.size, layout.size))
-    x, u = (part.swapaxes(-2, -3) for part in layout.split(unit))  # time before the columns of the identity
-    residual = x[..., 1:, :, :] - along(A, x[..., :-1, :, :]) - along(B, u)
-    return residual.swapaxes(-2, -3).reshape(*A.shape[:-3], layout.size, -1).swapaxes(-1, -2)
-
-
 def along(M: np.ndarray, vectors: np.ndarray) -> np.ndarray:
     """M v for every vector: M (*robots, a, b) and vectors (*robots, ..., b) give (*robots, ..., a).
 
