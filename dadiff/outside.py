@@ -5,13 +5,29 @@ Nothing here waits for a pipe or a device, follows aliases without end, or makes
 
 from __future__ import annotations
 
+import hashlib
+import math
 import re
 import stat
-from collections.abc import Hashable
+import tokenize
+import zipfile
+import zlib
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import IO, TYPE_CHECKING, Any
 
 from dadiff.errors import DataError
+from dadiff.memory import available, in_words
+
+if TYPE_CHECKING:
+    import numpy as np
+
+UNREADABLE = (
+    *(OSError, EOFError, ValueError, SyntaxError, RuntimeError, OverflowError),
+    *(zipfile.BadZipFile, zlib.error, tokenize.TokenError),
+)
+"""What zipfile and numpy raise on damaged, encrypted or unknown content, and on pickled objects."""
 
 MOST_TEXT = 64 * 2**20
 """Bytes of a json or yaml file: the largest of ours, the record of a sweep of 10,000 cells, has 20 MB."""
@@ -94,11 +110,86 @@ def check_aliases(root: Any, where: str) -> None:
         )
 
 
+def digest_of(paths: Iterable[Path], root: Path | None = None) -> str:
+    """A hash of what plain files hold and, below `root`, of how they are called: 16 hexadecimal digits.
+
+    Raises:
+        DataError: if one is no plain file.
+    """
+    digest = hashlib.sha256()
+    for path in paths:
+        if root is not None:
+            digest.update(path.relative_to(root).as_posix().encode())
+        with regular(path).open("rb") as stream:
+            while block := stream.read(2**20):
+                digest.update(block)
+    return digest.hexdigest()[:16]
+
+
+@contextmanager
+def npz(path: Path, what: str = "an array") -> Iterator[np.lib.npyio.NpzFile]:
+    """An .npz file open for reading, its headers judged; nothing in it is executed.
+
+    Args:
+        what: is read from it, for the message.
+
+    Raises:
+        DataError: if it is no such file, declares more than it holds or than fits, or what is read is damaged.
+    """
+    import numpy as np
+
+    if not zipfile.is_zipfile(regular(path)):
+        raise DataError(f"{path}: is not a readable .npz file; write it with numpy.savez")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            _check_headers(archive, path)
+        with np.load(path, allow_pickle=False) as arrays:
+            yield arrays
+    except UNREADABLE as error:
+        raise DataError(f"{path}: {what} cannot be read ({' '.join(str(error).split())})") from error
+
+
+def _check_headers(archive: zipfile.ZipFile, path: Path) -> None:
+    members = archive.infolist()
+    if (size := sum(member.file_size for member in members)) > available():
+        raise DataError(f"{path}: holds {in_words(size)} when unpacked, {in_words(available())} of memory are there")
+    for member in members:
+        with archive.open(member) as stream:
+            declared = _declared(stream)
+        if declared > member.file_size:
+            raise DataError(
+                f"{path}: array {member.filename.removesuffix('.npy')} claims {in_words(declared)} and holds "
+                f"{in_words(member.file_size)}; it is damaged or made up"
+            )
+
+
+def _declared(stream: IO[bytes]) -> int:
+    """Bytes of the array that an .npy header claims."""
+    from numpy.lib import format as npy
+
+    readers = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
+    shape, _, dtype = readers.get(npy.read_magic(stream), _unknown)(stream)
+    return math.prod(shape) * dtype.itemsize
+
+
+def _unknown(stream: IO[bytes]) -> Any:
+    raise ValueError("an array of a format that holds no plain numbers")
+
+
 def without_passwords(text: str) -> str:
     """Text as it may be shown: "postgresql://me:secret@host/db" becomes "postgresql://me@host/db"."""
     return PASSWORD.sub(r"\1@", text)
 
 
-def spreadsheet_safe(value: Hashable) -> Hashable:
-    """A cell of a table as text that a spreadsheet takes for text, not for a formula."""
-    return f"'{value}" if isinstance(value, str) and value[:1] in "=+-@\t\r" and value else value
+def passwords_removed(value: Any) -> Any:
+    """Plain data with `without_passwords` applied to every text in it."""
+    if isinstance(value, Mapping):
+        return {name: passwords_removed(part) for name, part in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [passwords_removed(part) for part in value]
+    return without_passwords(value) if isinstance(value, str) else value
+
+
+def spreadsheet_safe(value: Any) -> Any:
+    """A cell of a table: text that a spreadsheet would take for a formula gets the mark of text before it."""
+    return f"'{value}" if isinstance(value, str) and value.startswith(("=", "+", "-", "@", "\t", "\r")) else value

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from dadiff.outside import npz
 from dadiff.tasks import Cases, Demonstrations
 
 
@@ -22,5 +23,5 @@ def save_data(folder: Path, draw: Callable[[], Demonstrations | Cases]) -> None:
 
 def load_data(folder: Path) -> dict[str, Any]:
     """The fields that `save_data` wrote: all but the layout of E, which is the task's to say."""
-    with np.load(folder / "data.npz", allow_pickle=False) as data:
+    with npz(folder / "data.npz") as data:
         return {**data, "notes": json.loads((folder / "notes.json").read_text())}

@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from dadiff.datasets.files import opened
 from dadiff.errors import DataError
+from dadiff.outside import npz, yaml_of
 from dadiff.tasks.environments import OPTIONAL, PARTS, REQUIRED, check, encode, join, parse
 from dadiff.tasks.obstacles import Obstacles
 
@@ -51,19 +51,14 @@ def load_environments(path: str | Path, task: Obstacles, time_step: float = 0.1)
 
 
 def _from_yaml(path: Path) -> list[Any]:
-    import yaml
-
-    try:
-        content = yaml.safe_load(path.read_text())
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise DataError(f"{path}: not readable as yaml: {' '.join(str(error).split())}") from error
+    content = yaml_of(path)
     if not isinstance(content, list):
         raise DataError(f"{path}: expected a list of environments; found {type(content).__name__}")
     return content
 
 
 def _from_npz(path: Path) -> list[Any]:
-    with opened(path, "an array") as file:
+    with npz(path) as file:
         arrays = {name: file[name] for name in file.files}
     for name in REQUIRED:
         if name not in arrays:

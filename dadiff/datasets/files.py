@@ -5,12 +5,7 @@ Files are read without pickle, so nothing in them is executed. Every complaint n
 
 from __future__ import annotations
 
-import hashlib
-import tokenize
-import zipfile
-import zlib
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -19,15 +14,11 @@ import numpy as np
 
 from dadiff.datasets.generated import Part
 from dadiff.errors import ConfigError, DataError
+from dadiff.outside import digest_of, npz
 from dadiff.systems import Recording, System
 from dadiff.tasks import Cases, Demonstrations, Task
 
 INPUT_NAMES = ("inputs", "controls")
-# What zipfile and numpy raise on damaged, encrypted or unknown content, and on pickled objects.
-UNREADABLE = (
-    *(OSError, EOFError, ValueError, SyntaxError, RuntimeError),
-    *(zipfile.BadZipFile, zlib.error, tokenize.TokenError),
-)
 
 
 @runtime_checkable
@@ -55,11 +46,7 @@ def list_files(folder: Path) -> list[Path]:
 
 def fingerprint(folder: Path) -> str:
     """A hash of the names and contents of all .npz files below a folder."""
-    digest = hashlib.sha256()
-    for file in sorted(folder.rglob("*.npz")):
-        digest.update(file.relative_to(folder).as_posix().encode())
-        digest.update(file.read_bytes())
-    return digest.hexdigest()[:16]
+    return digest_of(sorted(folder.rglob("*.npz")), folder)
 
 
 def read_array(file: Path, names: Sequence[str], shape: tuple[int | None, ...]) -> np.ndarray:
@@ -85,30 +72,11 @@ def read_array(file: Path, names: Sequence[str], shape: tuple[int | None, ...]) 
 
 
 def _first_of(file: Path, names: Sequence[str], label: str) -> np.ndarray:
-    with opened(file, f"array {label}") as archive:
+    with npz(file, f"array {label}") as archive:
         present = [name for name in names if name in archive.files]
         if not present:
             raise DataError(f"{file}: has no array {label}; found {', '.join(archive.files) or 'none'}")
         return np.asarray(archive[present[0]])
-
-
-@contextmanager
-def opened(file: Path, what: str) -> Iterator[np.lib.npyio.NpzFile]:
-    """An .npz file open for reading; nothing in it is executed.
-
-    Args:
-        what: is read from it, for the message.
-
-    Raises:
-        DataError: if it is no such file, or what is read from it is damaged.
-    """
-    if not zipfile.is_zipfile(file):
-        raise DataError(f"{file}: is not a readable .npz file; write it with numpy.savez")
-    try:
-        with np.load(file, allow_pickle=False) as archive:
-            yield archive
-    except UNREADABLE as error:
-        raise DataError(f"{file}: {what} cannot be read ({' '.join(str(error).split())})") from error
 
 
 @dataclass(frozen=True)

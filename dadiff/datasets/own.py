@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from dadiff.datasets.environments import load_environments
 from dadiff.datasets.generated import Generated, Part
 from dadiff.errors import ConfigError, DataError
 from dadiff.experts.obstacles.problem import time_step_of
+from dadiff.outside import digest_of
 from dadiff.systems import System
 from dadiff.tasks import Cases, Demonstrations, Task
 from dadiff.tasks.obstacles import Obstacles
@@ -43,7 +43,7 @@ class OwnEnvironments:
             return self.generated.determined_by("train")
         if not (file := Path(self.path)).is_file():
             raise DataError(f"{file}: no such file; set dataset.path to a yaml or npz file of environments")
-        return {"content": hashlib.sha256(file.read_bytes()).hexdigest()[:16]}
+        return {"content": digest_of([file])}
 
     def train(self, task: Task, system: System) -> Demonstrations:
         """Generated demonstrations."""

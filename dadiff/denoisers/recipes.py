@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, ClassVar, Protocol, runtime_checkable
 from dadiff.denoisers.prediction import PredictionChoice
 from dadiff.diffusion.schedule import Schedule
 from dadiff.errors import ConfigError
+from dadiff.memory import check_fits
 from dadiff.trajectory import Layout, TrajectoryLayout
 
 if TYPE_CHECKING:
@@ -57,6 +58,11 @@ def _check_positive(component: str, **sizes: int) -> None:
             raise ConfigError(f"denoiser {component}: {name} is {value}; it must be at least 1")
 
 
+def _check_trainable(weights: int, **sizes: int) -> None:
+    """Whether so many weights fit, with their gradients, Adam's two moments and the running mean."""
+    check_fits(5 * 4 * weights, "denoiser: " + ", ".join(f"{name}={value}" for name, value in sizes.items()))
+
+
 @dataclass(frozen=True)
 class EncoderDecoder:
     """The paper's network (Section IV-A): three convolutions to a latent vector, three back.
@@ -77,6 +83,8 @@ class EncoderDecoder:
 
     def __post_init__(self) -> None:
         _check_positive("encoder_decoder", channels=self.channels, kernel=self.kernel, latent_dim=self.latent_dim)
+        weights = self.channels * (4 * self.channels * self.kernel + 2 * self.latent_dim)
+        _check_trainable(weights, channels=self.channels, kernel=self.kernel, latent_dim=self.latent_dim)
         if self.kernel % 2 == 0:
             raise ConfigError(f"denoiser encoder_decoder: kernel is {self.kernel}; it must be odd to keep the horizon")
 
@@ -110,6 +118,7 @@ class MLP:
 
     def __post_init__(self) -> None:
         _check_positive("mlp", width=self.width, blocks=self.blocks)
+        _check_trainable(2 * self.blocks * self.width**2, width=self.width, blocks=self.blocks)
 
     def build(
         self, layout: TrajectoryLayout, condition: Layout, schedule: Schedule, generator: torch.Generator
@@ -143,6 +152,7 @@ class RecordingMLP:
 
     def __post_init__(self) -> None:
         _check_positive("mlp_recording", width=self.width, blocks=self.blocks, context=self.context)
+        _check_trainable(2 * self.blocks * self.width**2 + self.context, width=self.width, context=self.context)
 
     def build(
         self, layout: TrajectoryLayout, condition: Layout, schedule: Schedule, generator: torch.Generator

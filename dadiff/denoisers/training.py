@@ -8,6 +8,7 @@ from typing import Literal
 
 from dadiff.denoisers.prediction import LossWeight
 from dadiff.errors import ConfigError
+from dadiff.memory import check_fits
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,7 @@ class Training:
         for name in ("steps", "batch_size", "checkpoint_every"):
             if (value := getattr(self, name)) < 1:
                 raise ConfigError(f"training: {name} is {value}; it must be at least 1")
+        check_fits(16 * self.steps + 4 * self.batch_size, f"training: steps={self.steps}, batch_size={self.batch_size}")
         if not (self.learning_rate > 0 and math.isfinite(self.learning_rate)):
             raise ConfigError(f"training: learning_rate is {self.learning_rate}; it must be positive")
         if self.warmup < 0 or self.seed < 0:

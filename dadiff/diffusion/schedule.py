@@ -13,6 +13,7 @@ from functools import cached_property
 import numpy as np
 
 from dadiff.errors import ConfigError
+from dadiff.memory import check_fits
 
 
 @dataclass(frozen=True)
@@ -78,6 +79,7 @@ def _steps(num_steps: int) -> np.ndarray:
     """i = 1..L."""
     if num_steps < 1:
         raise ConfigError(f"schedule: num_steps is {num_steps}; it must be at least 1")
+    check_fits(6 * 8 * num_steps, f"schedule: num_steps={num_steps}")
     return np.arange(1, num_steps + 1)
 
 

@@ -10,21 +10,26 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import wraps
+from pathlib import Path
 from typing import Any
 
 import hydra._internal.hydra
 import hydra._internal.utils
+import yaml
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra._internal.sources_registry import SourcesRegistry
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import ChoiceSweep, Override, RangeSweep
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
+from hydra.plugins.config_source import ConfigResult, ConfigSource
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-from yaml import YAMLError
 
 from dadiff.config.composed import output_folder
 from dadiff.errors import ConfigError
+from dadiff.outside import check_aliases, text_of
 
 MOST_CELLS = 10_000
 """Of a sweep: composing and naming each takes about 10 ms, before the first one runs."""
@@ -46,7 +51,7 @@ FIXED: Mapping[str, Any] = {
 
 
 MALFORMED = (
-    *(HydraException, OmegaConfBaseException, YAMLError, OSError, RecursionError),
+    *(HydraException, OmegaConfBaseException, yaml.YAMLError, OSError, RecursionError),
     *(AttributeError, KeyError, TypeError, ValueError),
 )
 """What Hydra raises when it composes from files and overrides that are none."""
@@ -97,6 +102,22 @@ def install() -> None:
     """Put the guarded loader in the place of Hydra's, and our way of reporting errors in that of its own."""
     hydra._internal.hydra.ConfigLoaderImpl = GuardedLoader  # type: ignore[misc]
     hydra._internal.utils.run_and_report = _reporting  # type: ignore[assignment]
+    source = SourcesRegistry.instance().resolve("file")
+    if not hasattr(source.load_config, "__wrapped__"):
+        source.load_config = _judging(source.load_config)  # type: ignore[assignment]
+
+
+def _judging(load: Callable[[ConfigSource, str], ConfigResult]) -> Callable[[ConfigSource, str], ConfigResult]:
+    """Hydra's reading of a preset, once its size and its aliases are judged."""
+
+    @wraps(load)
+    def judged(source: ConfigSource, config_path: str) -> ConfigResult:
+        path = Path(source.path, source._normalize_file_name(config_path))
+        if path.exists() and "&" in (text := text_of(path)):
+            check_aliases(yaml.compose(text, Loader=yaml.SafeLoader), str(path))
+        return load(source, config_path)
+
+    return judged
 
 
 def one_line(error: BaseException) -> str:

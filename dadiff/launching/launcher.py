@@ -8,6 +8,7 @@ import sys
 from abc import abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from types import FrameType
 from typing import Any
 
@@ -25,6 +26,7 @@ from dadiff.launching.pool import Pool
 from dadiff.launching.sweep import SweepRun, summary
 from dadiff.launching.table import Table
 from dadiff.launching.work import Running, Work
+from dadiff.outside import text_of, without_passwords
 from dadiff.store import DONE, Lease, Sweeps
 
 
@@ -65,6 +67,7 @@ class SweepLauncher(Launcher):
             sys.stdout.write(describe(plan) + "\n")
             return 0
         name = self.sweep or self.config.hydra.runtime.choices.get("sweeps")
+        _conceal(Path(plan.cells[0].config["output_dir"]) / "multirun.yaml")
         run = SweepRun.of(plan, name, "dadiff " + shlex.join(sys.argv[1:]), definition(self.config))
         if run.is_over():
             return _say_over(run)
@@ -122,6 +125,12 @@ def definition(config: DictConfig) -> dict[str, str]:
 def _say_over(run: SweepRun) -> int:
     sys.stderr.write(f"{run.name}: all {len(run.plan.cells)} cells are done already (force=true runs them again)\n")
     return 0
+
+
+def _conceal(path: Path) -> None:
+    """Remove passwords from what Hydra writes of a multirun."""
+    if path.is_file() and (text := text_of(path)) != (shown := without_passwords(text)):
+        path.write_text(shown)
 
 
 @contextmanager

@@ -7,6 +7,7 @@ import io
 from dataclasses import dataclass
 from typing import Any
 
+from dadiff.outside import spreadsheet_safe
 from dadiff.reporting.aggregation import FLOORS, Evidence, Method, has_metric, pair, varying
 from dadiff.reporting.labels import method_name
 from dadiff.reporting.selection import Selector
@@ -106,7 +107,8 @@ def to_csv(table: Table) -> str:
     for row in table.rows:
         counts = " ".join(f"{name}={count}" for name, count in row.counts.items())
         numbers = [x for metric in table.metrics for part in parts for x in _numbers(row.values[metric], part)]
-        writer.writerow([row.label, row.outcome, counts, " ".join(row.runs), *numbers])
+        words = map(spreadsheet_safe, (row.label, row.outcome, counts, " ".join(row.runs)))
+        writer.writerow([*words, *numbers])
     return buffer.getvalue()
 
 

@@ -19,6 +19,7 @@ from dadiff.diffusion.chain import Samples
 from dadiff.evaluation import replay, tracking_errors
 from dadiff.evaluation.mahalanobis import MahalanobisDistance
 from dadiff.evaluation.records import ChainRecorder, Snapshots, headline, merged, tables
+from dadiff.outside import passwords_removed
 from dadiff.planning.files import in_folder
 from dadiff.randomness import numpy_generator, torch_generator
 from dadiff.running.assembly import Experiment
@@ -148,7 +149,7 @@ def _store(experiment: Experiment, plans: Plans, started: float) -> StoredRun:
         notes={"cases": experiment.cases.notes, "schedule": experiment.parts.schedule.conditions()},
         counts=_counts(experiment),
     )
-    files = {"config.yaml": yaml.safe_dump(dict(experiment.config), sort_keys=False).encode()}
+    files = {"config.yaml": yaml.safe_dump(passwords_removed(experiment.config), sort_keys=False).encode()}
     if trained := experiment.identity.denoiser:
         files |= in_folder(experiment.planner, trained.key)
     return experiment.results.write(record, files=files, tables=written, arrays=arrays)

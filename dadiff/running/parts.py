@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from dadiff.config import Settings, assemble
+from dadiff.running.sizes import check_sizes
 
 if TYPE_CHECKING:
     from dadiff.behaviours import Projector
@@ -54,7 +55,9 @@ class Parts:
         """Those of a resolved configuration.
 
         Raises:
-            ConfigError: if it is not valid.
+            ConfigError: if it is not valid, or asks for more memory than there is.
         """
         made = assemble(config)
-        return cls(made.settings, made.nodes, **made.components)
+        parts = cls(made.settings, made.nodes, **made.components)
+        check_sizes(parts)
+        return parts

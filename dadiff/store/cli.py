@@ -9,6 +9,7 @@ from collections import Counter
 from pathlib import Path
 
 from dadiff.errors import DadiffError, StoreError
+from dadiff.memory import in_words
 from dadiff.store.cache import Cache, Entry, damage
 from dadiff.store.folder import is_store
 from dadiff.store.results import Results
@@ -20,15 +21,6 @@ def users(output_dir: Path) -> Counter[tuple[str, str]]:
     return Counter(link for run in Results(output_dir) for link in run.record.links.items())
 
 
-def size_text(size: int) -> str:
-    """A number of bytes for people: "1.4 MB"."""
-    value, units = float(size), iter(("B", "kB", "MB", "GB", "TB"))
-    unit = next(units)
-    while value >= 1000 and unit != "TB":
-        value, unit = value / 1000, next(units)
-    return f"{value:.0f} {unit}" if unit == "B" else f"{value:.1f} {unit}"
-
-
 def list_entries(output_dir: Path) -> list[str]:
     """One line an entry: kind, key, size, state, number of runs that were made with it."""
     counts = users(output_dir)
@@ -37,7 +29,7 @@ def list_entries(output_dir: Path) -> list[str]:
     for entry in Cache(output_dir).entries():
         total += entry.size
         lines.append(_line(entry, counts[entry.kind, entry.key]))
-    return [*lines, f"{'total':<10} {'':<16} {size_text(total):>9}"]
+    return [*lines, f"{'total':<10} {'':<16} {in_words(total):>9}"]
 
 
 def verify(output_dir: Path) -> list[str]:
@@ -86,7 +78,7 @@ def _check_quiet(output_dir: Path) -> None:
 
 
 def _line(entry: Entry, count: int) -> str:
-    return f"{entry.kind:<10} {entry.key:<16} {size_text(entry.size):>9}  {entry.state:<8}  {count}"
+    return f"{entry.kind:<10} {entry.key:<16} {in_words(entry.size):>9}  {entry.state:<8}  {count}"
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -17,6 +17,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dadiff.errors import DataError, LockedError, StoreError
+from dadiff.memory import available, in_words
+from dadiff.outside import npz, passwords_removed
 from dadiff.store.files import (
     broken_seals,
     checksum,
@@ -92,14 +94,16 @@ class StoredRun:
         return read_table(self.folder, name)
 
     def arrays(self, name: str = "examples") -> dict[str, np.ndarray]:
-        """The arrays of an npz file; empty if the run has none."""
-        import numpy as np
+        """The arrays of an npz file; empty if the run has none.
 
+        Raises:
+            DataError, StoreError: if the file is damaged.
+        """
         path = self.folder / f"{name}.npz"
         if not path.is_file():
             return {}
         _check_seal(path)
-        with np.load(path, allow_pickle=False) as stored:
+        with npz(path) as stored:
             return {key: stored[key] for key in stored.files}
 
 
@@ -138,9 +142,20 @@ def read_table(folder: Path, name: str) -> pd.DataFrame:
         raise StoreError(f"{path}: this run has no such table; see status and reason in its {RECORD}")
     _check_seal(path)
     try:
+        _check_table(path)
         return pd.read_parquet(path)
-    except (OSError, ValueError) as error:
-        raise StoreError(f"{path}: is damaged ({error}); run it again with force=true") from error
+    except (OSError, ValueError, KeyError) as error:
+        text = " ".join(str(error).split())
+        raise StoreError(f"{path}: is damaged ({text}); run it again with force=true") from error
+
+
+def _check_table(path: Path) -> None:
+    """Refuse a table that unpacks to more than fits: a few bytes may stand for any number of equal rows."""
+    from pyarrow.parquet import read_metadata
+
+    metadata = read_metadata(path)
+    if (size := 8 * metadata.num_rows * metadata.num_columns) > available():
+        raise StoreError(f"{path}: holds {in_words(size)} when unpacked, {in_words(available())} of memory are there")
 
 
 class Results:
@@ -249,7 +264,8 @@ class Results:
             np.savez(work / "examples.npz", **dict(arrays))  # type: ignore[arg-type]
         for name, content in (files or {}).items():
             (work / name).write_bytes(content)
-        write_json(work / RECORD, replace(record, files=seal(files_in(work), work)).to_json())
+        sealed = replace(record, files=seal(files_in(work), work)).to_json()
+        write_json(work / RECORD, passwords_removed(sealed))
         sync_folder(work)
         _replace(work, self.folder(record.key))
         return self.read(record.key)

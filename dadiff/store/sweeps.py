@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from dadiff.errors import DataError, LockedError
+from dadiff.outside import passwords_removed
 from dadiff.store.files import is_locked, locked, make_folder, write_json
 from dadiff.store.names import SWEEP, key_of, sweep_name
 from dadiff.store.typed import read_typed
@@ -127,7 +128,7 @@ class Sweeps:
     def write(self, sweep: Sweep) -> Path:
         """Store a sweep in place of an older one of its name."""
         folder = make_folder(self.folder(sweep.name))
-        write_json(folder / "sweep.json", asdict(sweep))
+        write_json(folder / "sweep.json", passwords_removed(asdict(sweep)))
         return folder
 
     def read(self, name: str) -> Sweep:

@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 
 from dadiff.errors import ConfigError
+from dadiff.memory import check_fits
 from dadiff.systems.linear import Linear
 from dadiff.systems.system import Bounds, Limits
 
@@ -48,6 +49,7 @@ def double_integrator(
     """
     if axes < 1:
         raise ConfigError(f"system: axes is {axes}; it must be at least 1")
+    check_fits(2 * 8 * (2 * axes) ** 2, f"system: axes={axes}")
     zero, one = np.zeros((axes, axes)), np.eye(axes)
     A, B = np.block([[zero, one], [zero, zero]]), np.vstack([zero, one])
     A, B = discretise(A, B, time_step, discretisation)

@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from dadiff.errors import ConfigError, ShapeError
+from dadiff.memory import check_fits
 from dadiff.randomness import numpy_generator
 from dadiff.systems.system import System
 
@@ -70,6 +71,7 @@ class GaussianExcitation:
     def __post_init__(self) -> None:
         if self.length < 1 or self.count < 1:
             raise ConfigError(f"recording: length is {self.length} and count {self.count}; both must be at least 1")
+        check_fits(16 * self.length * self.count, f"recording: length={self.length}, count={self.count}")
         for name, std in (("input_std", self.input_std), ("process_noise", self.process_noise)):
             if std is not None and not (np.isfinite(std).all() and (np.asarray(std) >= 0).all()):
                 raise ConfigError(f"recording: {name} is {std}; a standard deviation is finite and not negative")

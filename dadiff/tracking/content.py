@@ -11,6 +11,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from dadiff.outside import spreadsheet_safe
 from dadiff.store import Results, StoredRun, Sweep
 
 if TYPE_CHECKING:
@@ -170,7 +171,8 @@ def results_table(sweep: Sweep, results: Results) -> pd.DataFrame:
     rows = []
     for cell in sweep.cells:
         metrics = results.read(cell.key).metrics if results.is_done(cell.key) else {}
-        rows.append({"name": cell.name, "status": cell.status, **cell.axes, **metrics, "key": cell.key})
+        row = {"name": cell.name, "status": cell.status, **cell.axes, **metrics, "key": cell.key}
+        rows.append({spreadsheet_safe(name): spreadsheet_safe(value) for name, value in row.items()})
     return pd.DataFrame(rows)
 
 
