@@ -15,6 +15,7 @@ from dadiff.behaviours.components import (
 from dadiff.behaviours.least_squares import Estimate, Transitions, least_squares
 from dadiff.behaviours.manifold import Manifold
 from dadiff.behaviours.pins import Pin
+from dadiff.behaviours.prediction import prediction_error
 from dadiff.behaviours.projection import Projection, ProjectionInfo
 from dadiff.behaviours.sets import Dynamics, Everything, Rollout, Span, TrajectorySet, Uncertain, compared
 from dadiff.behaviours.stages import Stages
@@ -45,4 +46,5 @@ __all__ = [
     "compared",
     "least_squares",
     "pins",
+    "prediction_error",
 ]

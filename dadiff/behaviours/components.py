@@ -6,18 +6,20 @@ set in physical units; see `dadiff.behaviours.sets`. `initial_state` says whethe
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Literal, Protocol, TypeVar
 
 import numpy as np
 
-from dadiff.behaviours.least_squares import Offset, Transitions, least_squares
+from dadiff.behaviours.least_squares import Offset, Transitions, least_squares, regressed
 from dadiff.behaviours.manifold import Manifold
 from dadiff.behaviours.pins import Pin
 from dadiff.behaviours.sets import Dynamics, Everything, InitialState, Rollout, Span, TrajectorySet, Uncertain
 from dadiff.behaviours.stages import stages_of
-from dadiff.errors import ConfigError, ExcitationError
+from dadiff.errors import ConfigError, ExcitationError, NotApplicableError
 from dadiff.systems import AffineSystem, Recording, System
+from dadiff.systems.features import Features, Term
 from dadiff.trajectory.hankel import identity_length, trajectory_matrix
 from dadiff.trajectory.layout import TrajectoryLayout
 from dadiff.trajectory.subspace import numerical_rank, rank_tolerance
@@ -184,15 +186,33 @@ class HankelLowRank:
 class Identified:
     """P = F F† with dynamics estimated by least squares: min sum_t |x(t+1) - A x(t) - B u(t) - c|^2.
 
+    With `features` they are nonlinear, x(t+1) = x(t) + Theta phi(x, u), see `dadiff.systems.features`.
+
     Args:
         initial_state: `fixed` holds x(0) = x_init.
         learn_from: transitions of the `recording`, of the `demonstrations`, or of both: they obey the same dynamics.
         offset: c is `none` (0), `estimated`, or `known` from the system.
+        features: terms of phi; none for linear dynamics.
+        angles: indices of the states whose sines and cosines are features.
+        ridge: weight of |Theta|^2 against the squared residuals, features scaled to deviation 1.
     """
 
     initial_state: InitialState = "free"
     learn_from: LearnFrom = "recording"
     offset: Offset = "none"
+    features: Sequence[Term] = ()
+    angles: Sequence[int] = ()
+    ridge: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("features", "angles"):
+            object.__setattr__(self, name, tuple(getattr(self, name)))
+        if not 0 <= self.ridge < np.inf:
+            raise ConfigError(f"projector: ridge is {self.ridge}; it must be finite and not negative")
+        if not self.features and (self.angles or self.ridge):
+            raise ConfigError("projector: angles and ridge are of features, and there are none; name some")
+        if self.features and self.offset != "none":
+            raise ConfigError("projector: with features the offset is one of them; use constant, and offset=none")
 
     @property
     def needs(self) -> frozenset[str]:
@@ -206,11 +226,15 @@ class Identified:
         system: System | None = None,
         recording: Recording | None = None,
         demonstrations: np.ndarray | None = None,
-    ) -> Dynamics:
+    ) -> Dynamics | Manifold:
         """The trajectories of the estimated dynamics."""
         data = transitions(self, layout, system, recording, demonstrations)
+        notes: dict[str, float] = {"rank": layout.rank}
+        if self.features:
+            phi = Features(layout.state_dim, layout.input_dim, self.features, self.angles)
+            return Manifold(layout, regressed(data, phi, self.ridge).system, notes=notes)
         estimate = least_squares(data, self.offset, known_offset(self, system))
-        return Dynamics(layout, estimate.stages(layout.horizon), notes={"rank": layout.rank})
+        return Dynamics(layout, estimate.stages(layout.horizon), notes=notes)
 
 
 @dataclass(frozen=True)
@@ -235,6 +259,10 @@ class IdentifiedSoft(Identified):
         demonstrations: np.ndarray | None = None,
     ) -> Uncertain:
         """The estimated dynamics, and the covariance of the residual."""
+        if self.features:
+            raise NotApplicableError(
+                "projector identified_soft: what it trusts is linear dynamics; with features use projector=identified"
+            )
         shown = _required(demonstrations, "identified_soft", "dataset")
         data = transitions(self, layout, system, recording, demonstrations)
         estimate = least_squares(data, self.offset, known_offset(self, system))

@@ -13,6 +13,7 @@ import numpy as np
 
 from dadiff.behaviours.stages import Stages, transposed
 from dadiff.errors import ExcitationError
+from dadiff.systems.features import Features, Regressed
 from dadiff.trajectory.subspace import numerical_rank
 
 ROUNDING = 1e-13
@@ -111,16 +112,64 @@ def least_squares(data: Transitions, offset: Offset = "none", known: np.ndarray 
     ones = [np.ones((*data.x.shape[:-1], 1))] if offset == "estimated" else []
     Phi = np.concatenate([data.x, data.u, *ones], axis=-1)
     _check_rank(Phi, n + m)
-    Q, R = np.linalg.qr(Phi)
-    target = data.following - given[..., None, :]
-    theta = transposed(np.linalg.solve(R, transposed(Q) @ target))
+    theta, spread, noise = regression(Phi, data.following - given[..., None, :])
+    c = theta[..., n + m] if ones else given
+    return Estimate(theta[..., :n], theta[..., n : n + m], c, spread, noise)
+
+
+def regression(Phi: np.ndarray, target: np.ndarray, ridge: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """min over theta of |target - Phi theta'|^2 + ridge |S theta'|^2, S the deviations of the columns of Phi.
+
+    Args:
+        Phi: (*robots, count, p).
+        target: (*robots, count, n).
+
+    Returns:
+        theta (*robots, n, p), (Phi' Phi + ridge S^2)^-1 of shape (*robots, p, p), and the residual's variance, p
+        degrees of freedom taken off, (*robots, n).
+    """
+    scale = np.sqrt(ridge) * _diagonal(Phi.std(axis=-2))
+    rows, right = Phi, target
+    if ridge:
+        rows = np.concatenate([Phi, scale], axis=-2)
+        right = np.concatenate([target, np.zeros((*scale.shape[:-1], target.shape[-1]))], axis=-2)
+    Q, R = np.linalg.qr(rows)
+    theta = transposed(np.linalg.solve(R, transposed(Q) @ right))
     residual = target - Phi @ transposed(theta)
-    freedom = max(Phi.shape[-2] - Phi.shape[-1], 1)
     inverse = np.linalg.inv(R)
-    return Estimate(
-        theta[..., :n], theta[..., n : n + m], theta[..., n + m] if ones else given,
-        inverse @ transposed(inverse), np.square(residual).sum(axis=-2) / freedom,
-    )  # fmt: skip
+    freedom = max(Phi.shape[-2] - Phi.shape[-1], 1)
+    return theta, inverse @ transposed(inverse), np.square(residual).sum(axis=-2) / freedom
+
+
+@dataclass(frozen=True)
+class Regression:
+    """x(t+1) = x + Theta phi(x, u), and how sure one is of Theta.
+
+    Args:
+        system: with the estimated Theta.
+        spread: (Phi' Phi)^-1, (*robots, p, p).
+        noise: variance of the residual of each state, (*robots, n).
+    """
+
+    system: Regressed
+    spread: np.ndarray = field(repr=False)
+    noise: np.ndarray = field(repr=False)
+
+
+def regressed(data: Transitions, features: Features, ridge: float = 0.0) -> Regression:
+    """Dynamics that are linear in features, from transitions.
+
+    Raises:
+        ExcitationError: if the features do not vary independently of one another, and nothing else decides (ridge = 0).
+    """
+    Phi = features(data.x, data.u)
+    if not ridge and (rank := numerical_rank(Phi)) < Phi.shape[-1]:
+        raise ExcitationError(
+            f"recording: its {Phi.shape[-2]} transitions span {rank} of the {Phi.shape[-1]} features; record longer, "
+            "with inputs that vary more, choose fewer features or a ridge"
+        )
+    theta, spread, noise = regression(Phi, data.following - data.x, ridge)
+    return Regression(Regressed(features, theta), spread, noise)
 
 
 def _check_rank(Phi: np.ndarray, needed: int) -> None:

@@ -49,6 +49,7 @@ METRICS = {
     "median_cost_ratio": "median cost / optimal cost",
     "robots_served": "share of robots served",
     "cost_ratio": "cost / optimal cost",
+    "prediction_error": "prediction error over T [deviations]",
     "principal_angle": "largest principal angle [rad]",
     "sampling_seconds": "sampling time [s]",
     "projection_seconds": "time per projection [s]",

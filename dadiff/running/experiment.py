@@ -14,7 +14,7 @@ import numpy as np
 import torch
 import yaml
 
-from dadiff.behaviours import Known, compared, pins
+from dadiff.behaviours import Known, compared, pins, prediction_error
 from dadiff.diffusion.chain import Samples
 from dadiff.evaluation import replay, tracking_errors
 from dadiff.evaluation.mahalanobis import MahalanobisDistance
@@ -113,6 +113,7 @@ def measured_projection(experiment: Experiment, environment: np.ndarray) -> tupl
     if experiment.sources:
         held = pins(experiment.parts.projector, experiment.layout, experiment.condition.get(environment, "x_init"))
         measures |= compared(behaviour, Known().fit(experiment.layout, experiment.target), held)
+        measures |= prediction_error(behaviour, experiment.target, experiment.cases.reference)
     return Timed(projection, experiment.device), measures
 
 

@@ -1,0 +1,99 @@
+"""Dynamics that are linear in features: derivatives, estimates from recordings, and what is refused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dadiff.behaviours import Dynamics, Identified, IdentifiedSoft, Known, Manifold, pins, prediction_error
+from dadiff.errors import ConfigError, ExcitationError, NotApplicableError, ShapeError
+from dadiff.systems import GaussianExcitation, PlanarQuadrotors, Simulated, double_integrator
+from dadiff.systems.features import Features, Regressed
+
+TERMS = [
+    ("constant", "identity"),
+    ("identity", "products"),
+    ("constant", "identity", "trigonometric", "control_affine"),
+    ("constant", "identity", "trigonometric", "products", "control_affine"),
+    ("trigonometric", "control_affine"),
+    ("identity", "control_affine"),
+]
+
+
+def features(terms):
+    return Features(3, 2, terms, (1,) if "trigonometric" in terms else ())
+
+
+@pytest.mark.parametrize("terms", TERMS, ids=",".join)
+@pytest.mark.parametrize("robots", [None, 4])
+def test_derivatives_agree_with_differences(terms, robots, rng):
+    phi = features(terms)
+    lead = () if robots is None else (robots,)
+    system = Regressed(phi, 0.1 * rng.standard_normal((*lead, 3, phi.count)))
+    x, u = rng.standard_normal((*lead, 5, 3)), rng.standard_normal((*lead, 5, 2))
+    differences = Simulated(system.step, 3, 2, num_robots=robots)
+    for found, expected in zip(system.linearise(x, u), differences.linearise(x, u), strict=True):
+        np.testing.assert_allclose(found, expected, atol=1e-8)
+
+
+@pytest.mark.parametrize("terms", TERMS, ids=",".join)
+@pytest.mark.parametrize(("ridge", "error"), [(0.0, 1e-6), (1e-10, 0.1)])
+def test_dynamics_in_the_span_of_the_features_are_found(terms, ridge, error, rng):
+    """With a ridge, features that are nearly dependent where the recording went are told apart less well."""
+    phi = features(terms)
+    truth = Regressed(phi, 0.02 * rng.standard_normal((2, 3, phi.count)) * (np.arange(phi.count) < 20))
+    recording = GaussianExcitation(20, count=40, process_noise=0.0).record(truth)
+    layout = truth.layout(6)
+    projector = Identified(features=terms, angles=phi.angles, ridge=ridge)
+    found = projector.fit(layout, truth, recording)
+    inputs = rng.standard_normal((2, 4, 6, 2))
+    tau = layout.flatten(truth.simulate(rng.standard_normal((2, 4, 3)), inputs), inputs)
+    assert isinstance(found, Manifold)
+    assert prediction_error(found, truth, tau)["prediction_error"] < error
+
+
+def test_a_quadrotor_is_predicted_far_better_with_features_than_linearly(rng):
+    robots = PlanarQuadrotors().inside(3, rng)
+    recording = GaussianExcitation(300, input_std=3.0).record(robots)
+    layout = robots.layout(20)
+    inputs = rng.standard_normal((3, 8, 20, 2))
+    tau = layout.flatten(robots.simulate(np.zeros((3, 8, 6)), inputs), inputs)
+    terms = ("constant", "identity", "trigonometric", "control_affine")
+    good = Identified("fixed", features=terms, angles=(2,), ridge=0.01).fit(layout, robots, recording)
+    linear = Identified("fixed").fit(layout, robots, recording)
+    assert isinstance(linear, Dynamics)
+    errors = [prediction_error(found, robots, tau)["prediction_error"] for found in (good, linear)]
+    assert errors[0] < 0.5 * errors[1]
+    x_init = rng.standard_normal((3, 8, 6))
+    project = good.bind(None, pins(Identified("fixed"), layout, x_init))
+    assert np.isfinite(project(tau)).all()
+
+
+def test_the_truth_predicts_itself(rng):
+    system = double_integrator()
+    layout = system.layout(5)
+    assert prediction_error(Known().fit(layout, system), system, rng.standard_normal((4, layout.size))) == {
+        "prediction_error": pytest.approx(0.0, abs=1e-12)
+    }
+
+
+def test_what_makes_no_sense_is_refused(rng):
+    system = double_integrator()
+    recording, layout = GaussianExcitation(10).record(system), system.layout(5)
+    for make, message in [
+        (lambda: Features(3, 2, ("trigonometric",)), "trigonometric terms need"),
+        (lambda: Features(3, 2, ("identity",), (1,)), "and only they do"),
+        (lambda: Features(3, 2, ("trigonometric",), (3,)), "the states are 0 to 2"),
+        (lambda: Identified(ridge=1.0), "angles and ridge are of features"),
+        (lambda: Identified(ridge=-1.0), "ridge is -1"),
+        (lambda: Identified(features=("identity",), offset="estimated"), "the offset is one of them"),
+    ]:
+        with pytest.raises(ConfigError, match=message):
+            make()
+    with pytest.raises(ShapeError, match="theta has shape"):
+        Regressed(Features(3, 2), np.zeros((3, 7)))
+    with pytest.raises(ExcitationError, match="10 transitions span 10 of the 17 features"):
+        Identified(features=("constant", "identity", "products")).fit(layout, system, recording)
+    soft, shown = IdentifiedSoft(features=("identity",)), rng.standard_normal((9, layout.size))
+    with pytest.raises(NotApplicableError, match="use projector=identified"):
+        soft.fit(layout, system, recording, shown)
