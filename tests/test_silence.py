@@ -86,7 +86,7 @@ def test_an_enforcement_keeps_of_the_displacement_what_it_says(enforcement, sche
     for j in (0, 1, 10, 29):
         if (k := enforcement.keeps(schedule, j)) is not None:
             expected = P(tau) + k * (tau - P(tau))
-            at = reaching(Step(j + 1, j, 0.0, 1.0, 0.0), schedule, P)
+            at = reaching(Step(j + 1, j, 0.0, 1.0, 0.0, call=False), schedule, P)
             np.testing.assert_allclose(enforcement.sample(tau, at), expected, atol=1e-12)
 
 

@@ -38,6 +38,11 @@ class Rows:
     g: np.ndarray = field(repr=False)
     noise: np.ndarray | None = field(default=None, repr=False)
 
+    def for_each_plan(self) -> Rows:
+        """With a dimension for the plans after the robots."""
+        noise = None if self.noise is None else self.noise[..., None, :, :]
+        return Rows(self.G[..., None, :, :], self.g[..., None, :], noise)
+
     def scaled(self, where: Coordinates) -> Rows:
         """From rows in physical units."""
         return Rows(self.G * where.scale, self.g - self.G @ where.mean, self.noise)
@@ -117,7 +122,12 @@ def onto_span(basis: np.ndarray, origin: np.ndarray, places: np.ndarray, where: 
 
 
 def in_metric(rows: Rows, metric: Covariance, places: np.ndarray, where: Coordinates) -> AffineMap:
-    """P in the metric C, as dense matrices. Rows that C says to be certain are left as they are."""
+    """P in the metric C, as dense matrices. Rows that C says to be certain are left as they are.
+
+    Args:
+        metric: C for all (d, d) or for each robot, or (*robots, plans, ...) with one for each plan.
+    """
+    rows = rows if metric.diagonal.ndim < rows.G.ndim else rows.for_each_plan()
     given, gain = metric.given(places)
     C, d = given.matrix, metric.size
     inner = rows.G @ C @ transposed(rows.G)
@@ -217,6 +227,11 @@ class Blocks:
             metric: C in scaled coordinates.
             noise: V of shape (*robots, nT, q), or None for R = 0.
         """
+        if metric.diagonal.ndim > len(stages.robots) + 1:
+            raise ConfigError(
+                "projection: a metric for each plan needs dense matrices, and these trajectories are too long for "
+                "them; use one metric for all plans"
+            )
         given, gain = metric.rescaled(where.scale).given(places)
         hold = Hold(where.scale, where.mean, places, gain)
         factorised = BlockTridiagonal.of(stages, layout, given.diagonal)

@@ -148,8 +148,9 @@ class Projection:
 
         Args:
             tau: (*robots, plans..., d), in the coordinates that the set was bound in.
-            metric: C in those coordinates; the correction is then C G' (G C G' + R)^-1 (G tau - g). None is the
-                identity. What follows from a C is computed once for the object.
+            metric: C in those coordinates, one for all plans or (*robots, plans..., d) with one for each; the
+                correction is then C G' (G C G' + R)^-1 (G tau - g). None is the identity. What follows from a C that
+                plans share is computed once for the object.
             start: where to begin; a closed form needs none.
             noise: unit noise of the shape of tau, from which an uncertain set draws its residual r ~ N(0, R): with tau
                 drawn from N(tau0_hat, C) the projection is then a draw of the conditional law (Matheron's rule).
@@ -163,9 +164,20 @@ class Projection:
             # Many small products, which numpy starts faster.
             drawn = None if noise is None else noise.numpy()
             return tau.new_tensor(self(tau.numpy(), metric, start, drawn))
+        if metric is not None and metric.diagonal.ndim > len(robots) + 1:
+            return self._plan_by_plan(tau, metric)
         form, given = self._bound(self._geometry.form(metric), tau)
         drawn = None if noise is None else noise.reshape(*robots, -1, d)
         return form(tau.reshape(*robots, -1, d), given, drawn).reshape(tau.shape)
+
+    def _plan_by_plan(self, tau: Array, metric: Covariance) -> Array:
+        """The projection with a metric (*robots, plans..., d) for each plan, which is used once."""
+        *robots, d = self._shape
+        factor = metric.factor.reshape(*robots, -1, d, metric.factor.shape[-1])
+        each = Covariance(metric.diagonal.reshape(*robots, -1, d), factor)
+        made = self._geometry.form(each)
+        form, given = like(made, tau), like(made.given(self._pinned.values[..., None, :]), tau)
+        return form(tau.reshape(*robots, -1, 1, d), given).reshape(tau.shape)
 
     def on(self, device: str) -> Projection:
         """Itself, with what projects float64 tensors in the identity metric on a device."""

@@ -135,3 +135,17 @@ class Context:
             tau = self.tau.clone().requires_grad_()
             tau0_hat = self.denoise.estimate(tau, self.step.i, self.environment.clone())
             return torch.autograd.grad(tau0_hat, tau, cotangent.clone())[0]
+
+    def jacobian(self) -> Array:
+        """J of shape (..., d, d), plan by plan; one more call, and d passes backwards.
+
+        Raises:
+            NotApplicableError: if the denoiser cannot be differentiated.
+        """
+        import torch
+
+        with torch.inference_mode(False), torch.enable_grad():
+            tau = self.tau.clone().requires_grad_()
+            entries = self.denoise.estimate(tau, self.step.i, self.environment.clone()).unbind(-1)
+            rows = [torch.autograd.grad(entry.sum(), tau, retain_graph=True)[0] for entry in entries]
+        return torch.stack(rows, dim=-2)
