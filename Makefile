@@ -26,9 +26,9 @@ install: .venv/installed
 
 report: install
 	$(RUN)/dadiff +sweeps=lqr_quick output_dir=$(OUTPUTS)
-	$(RUN)/dadiff-report lqr_quick --output-dir $(OUTPUTS)
+	$(RUN)/dadiff-report lqr_quick --log --output-dir $(OUTPUTS)
 	$(RUN)/dadiff +sweeps=obstacles_quick output_dir=$(OUTPUTS)
-	$(RUN)/dadiff-report obstacles_quick --output-dir $(OUTPUTS)
+	$(RUN)/dadiff-report obstacles_quick --log --output-dir $(OUTPUTS)
 	@echo
 	@echo "reports: $(OUTPUTS)/reports/lqr_quick/index.html  $(OUTPUTS)/reports/obstacles_quick/index.html"
 	@echo "runs:    $(RUN)/mlflow ui --backend-store-uri sqlite:///$(abspath $(OUTPUTS))/mlflow.db"

@@ -34,15 +34,13 @@ def one_run(config: dict[str, Any]) -> None:
     if experiment.parts.settings.dry_run:
         print(f"{experiment.identity.key}  {experiment.identity.name}")
         return
-    experiment.parts.tracking.prepare()
-    experiment.parts.tracking.close_dead(experiment.output_dir)
-
-    from dadiff.launching.jobs import run_experiment
+    from dadiff.launching.jobs import run_tracked
     from dadiff.running.summary import summary
 
-    stored = run_experiment(experiment)
+    before = experiment.is_done
+    stored = run_tracked(experiment)
     print(summary([stored]))
-    print(f"stored in {stored.folder}")
+    print(f"stored {'before, nothing was run: ' if before else 'in '}{stored.folder}")
 
 
 @hydra.main(version_base="1.3", config_path=str(shipped("conf").absolute()), config_name="config")

@@ -1,23 +1,20 @@
-"""`dadiff-sync`: upload to MLflow what is on disk and not there yet, for example because its server was away."""
+"""`dadiff-sync`: make MLflow again from what lies on disk, or bring it up to that."""
 
 from __future__ import annotations
 
 import argparse
 import logging
 import sys
-from dataclasses import replace
+from collections import defaultdict
 from pathlib import Path
 
 from dadiff.errors import DadiffError
-from dadiff.launching.jobs import tracking_of
-from dadiff.store import Cache, Results, StoredRun
-from dadiff.tracking import Tracking, is_tracked
+from dadiff.store import Results, StoredRun, Sweeps
+from dadiff.tracking import Tracking
 
 
-def sync(output_dir: Path, uri: str | None = None) -> tuple[int, int]:
-    """Upload stored runs and the trainings that they were made with, and close what was killed.
-
-    Returns (uploaded, still missing).
+def sync(output_dir: Path, uri: str | None = None) -> int:
+    """Mirror all stored runs, their trainings and their sweeps, where the store lacks them. Returns how many it lacked.
 
     Args:
         uri: the store; None takes for each run the one that it was configured with.
@@ -25,44 +22,35 @@ def sync(output_dir: Path, uri: str | None = None) -> tuple[int, int]:
     Raises:
         StoreError: if a store is away.
     """
-    before = after = 0
-    stores: dict[str, Tracking] = {}
-    runs = [run for run in Results(output_dir) if run.record.is_done and run.record.config["tracking"]["enabled"]]
-    for run in runs:
-        tracking = tracking_of(run.record.config)
-        if uri is not None:
-            tracking = replace(tracking, uri=uri, parent=None)
-        tracking = replace(stores.setdefault(tracking.uri, tracking), parent=tracking.parent)
-        before += is_tracked(run.folder, tracking.uri)
-        _upload(output_dir, run, tracking)
-        after += is_tracked(run.folder, tracking.uri)
-    for tracking in stores.values():
+    sweeps, brought = Sweeps(output_dir), 0
+    cells = {name: {cell.key for cell in sweeps.read(name).cells} for name in sweeps.names()}
+    for tracking, runs in _by_store(output_dir, uri).items():
         tracking.prepare()
-        tracking.close_dead(output_dir)
-    return after - before, len(runs) - after
+        keys = {run.key for run in runs}
+        brought += tracking.catch_up(output_dir, runs, [name for name, its in cells.items() if its & keys])
+    return brought
 
 
-def _upload(output_dir: Path, run: StoredRun, tracking: Tracking) -> None:
-    if is_tracked(run.folder, tracking.uri):
-        return
-    tracking.prepare()
-    denoiser = run.record.links.get("denoiser")
-    if denoiser and Cache(output_dir).contains("denoiser", denoiser):
-        tracking.log_training(Cache(output_dir).folder("denoiser", denoiser))
-    tracking.log_run(run)
+def _by_store(output_dir: Path, uri: str | None) -> dict[Tracking, list[StoredRun]]:
+    stores = defaultdict(list)
+    for run in Results(output_dir):
+        tracking = Tracking.of(run.record.config, output_dir, uri)
+        if tracking.enabled:
+            stores[tracking].append(run)
+    return stores
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """The command line; returns its exit code, 1 if something could not be uploaded."""
-    parser = argparse.ArgumentParser("dadiff-sync", description="Upload stored results that MLflow does not have yet.")
+    """The command line; returns its exit code."""
+    parser = argparse.ArgumentParser("dadiff-sync", description="Bring MLflow up to the results on disk.")
     parser.add_argument("--output-dir", type=Path, default=Path("outputs"), help="where results lie (outputs)")
     parser.add_argument("--uri", help="the MLflow store (that of each run's configuration)")
     given = parser.parse_args(arguments)
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
     try:
-        uploaded, missing = sync(given.output_dir, given.uri)
+        brought = sync(given.output_dir, given.uri)
     except DadiffError as error:
         print(f"dadiff-sync: {error}", file=sys.stderr)
         return 1
-    print(f"{uploaded} runs uploaded, {missing} still missing")
-    return int(missing > 0)
+    print(f"{brought} were missing in MLflow and are there now")
+    return 0

@@ -142,7 +142,7 @@ def test_a_tiny_training_is_done_once_for_two_projectors(tmp_path):
     overrides = [o for o in SMALL if o != "denoiser=gaussian"] + ["training.steps=5", "training.batch_size=8"]
     small = ["denoiser.width=8", "denoiser.blocks=1", "training.warmup=1", f"output_dir={tmp_path}"]
     known, none = (composed(f"projector={name}", *overrides, *small) for name in ("known", "none"))
-    Experiment.of(known).prepare()
+    Experiment.of(known).build("denoiser")
     models = list((tmp_path / "cache" / "denoiser").glob("*/model.safetensors"))
     stamps = [model.stat().st_mtime_ns for model in models]
     runs = [execute(Experiment.of(known)), execute(Experiment.of(none))]

@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from dadiff.tracking.markers import Marker, read_marker, write_marker
 
 from dadiff.errors import DadiffError, DataError, StoreError
 from dadiff.store import Cache, Cell, Record, Results, Sweep, Sweeps
 from dadiff.store.cli import main as dadiff_cache
 from dadiff.store.names import file_name, key_of, kind_of, sweep_name
-from dadiff.tracking.markers import Marker, read_marker, write_marker
 
 KEYS = ("0123456789abcdef", "fedcba9876543210")
 URI = "sqlite:////tmp/mlflow.db"

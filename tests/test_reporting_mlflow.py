@@ -9,8 +9,7 @@ import pytest
 from made_up import MadeUp
 
 from dadiff.reporting import cli
-from dadiff.store import Results, Sweeps
-from dadiff.tracking import Tracking
+from dadiff.sync import sync
 
 pytestmark = pytest.mark.slow
 
@@ -24,13 +23,8 @@ def tracked(tmp_path_factory) -> tuple[Path, str]:
     store.run(0.2, projector="known", enforcement="normalised")
     store.run(status="diverged", step=3, projector="known", enforcement="literal")
     store.sweep()
-    uri, sweep = f"sqlite:///{folder}/mlflow.db", Sweeps(folder).read(store.name)
-    parent = Tracking(uri, artifacts=str(folder / "mlartifacts")).open_sweep(sweep, folder)
-    tracking = Tracking(uri, artifacts=str(folder / "mlartifacts"), parent=parent)
-    for run in Results(folder):
-        tracking.log_run(run)
-    tracking.close_sweep(parent, sweep, folder, "finished")
-    return folder, uri
+    sync(folder)
+    return folder, f"sqlite:///{folder}/mlflow.db"
 
 
 @pytest.mark.parametrize("name", ["lqr_made_up", "dadiff"])

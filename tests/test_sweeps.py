@@ -16,9 +16,8 @@ from dadiff.launching import register
 from dadiff.launching.outcome import Outcome, why
 from dadiff.launching.plan import describe, make_plan
 from dadiff.launching.sweep import SweepRun, summary
-from dadiff.store import DONE, Cache, Results, Sweeps
+from dadiff.store import Cache, Results, Sweeps
 from dadiff.sync import sync
-from dadiff.tracking import is_tracked
 from dadiff.tracking.client import open_client
 
 TINY = [
@@ -58,7 +57,7 @@ def run_here(run: SweepRun) -> dict[str, Outcome]:
     """Do the sweep's work in this process, as the launcher's pool does it in others."""
     cells = {cell.identity.key: cell for cell in run.plan.cells}
     parent, outcomes = run.open(), {}
-    for work in run.works(parent):
+    for work in run.works():
         try:
             work.function(*work.arguments)
             outcomes[work.key] = Outcome("finished", None, 0.0)
@@ -66,7 +65,8 @@ def run_here(run: SweepRun) -> dict[str, Outcome]:
             outcomes[work.key] = Outcome(*why(error), 0.0)
         if work.key in cells:
             run.ended(cells[work.key], outcomes[work.key])
-    run.close(parent, outcomes, interrupted=False)
+        run.mirror(work.key, parent)
+    run.close(outcomes, interrupted=False)
     return outcomes
 
 
@@ -123,16 +123,13 @@ def test_a_rerun_does_only_what_failed(first, root):
     run = SweepRun.of(make_plan(configs(root)), "quick", "dadiff", {})
     assert [cell.identity.name.split("/")[1] for cell in run.plan.waiting] == ["identified"]
     assert run.plan.preparations == []
-    assert len(run.works(None)) == 1
-    assert not run.is_over()
+    assert len(run.works()) == 1
 
 
-def test_a_sweep_whose_cells_are_done_is_over(first, root):
+def test_a_sweep_whose_cells_are_done_has_nothing_to_do(first, root):
     run = SweepRun.of(make_plan(configs(root, CELLS[:3])), "over", "dadiff", {})
-    assert not run.is_over()  # its record is not written yet
     assert run_here(run) == {}
-    again = SweepRun.of(make_plan(configs(root, CELLS[:3])), "over", "dadiff", {})
-    assert again.is_over()
+    assert [cell.status for cell in Sweeps(root).read("over").cells] == ["finished"] * 2
     forced = make_plan(configs(root, [[*CELLS[0], "force=true"]]))
     assert len(forced.waiting) == 1
 
@@ -141,15 +138,11 @@ def test_choices_that_exclude_one_another_are_refused_as_a_result(root):
     cells = [["projector=known_fixed", "enforcement=literal"]]
     run = SweepRun.of(make_plan(configs(root, cells)), "excluding", "dadiff", {})
     assert [outcome.status for outcome in run_here(run).values()] == ["refused"]
-    assert SweepRun.of(make_plan(configs(root, cells)), "excluding", "dadiff", {}).is_over()
+    assert make_plan(configs(root, cells)).waiting == []
 
 
-def test_sync_uploads_to_another_store_what_is_missing(first, root, tmp_path):
-    uri = f"sqlite:///{tmp_path}/other.db"
-    done = [run for run in Results(root) if run.status in DONE]
-    assert sync(root, uri) == (len(done), 0)
-    assert sync(root, uri) == (0, 0)
-    assert all(is_tracked(run.folder, uri) for run in Results(root) if run.status == "finished")
+def test_sync_finds_nothing_missing_after_a_sweep(first, root):
+    assert sync(root) == 0
 
 
 def test_plans_are_made_without_torch_and_mlflow():

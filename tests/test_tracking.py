@@ -1,12 +1,11 @@
-"""Laws of tracking: MLflow mirrors what is on disk, once, and nothing stays RUNNING without its process."""
+"""Laws of tracking: MLflow mirrors what is on disk, once, and is made again from it whatever became of it."""
 
 from __future__ import annotations
 
 import json
 import logging
-import multiprocessing
 import os
-import signal
+import shutil
 import sqlite3
 import subprocess
 import sys
@@ -18,8 +17,10 @@ import pandas as pd
 import pytest
 
 from dadiff.errors import ConfigError, StoreError
-from dadiff.store import Cache, Cell, Provenance, Record, Results, Sweep, Sweeps
-from dadiff.tracking import Tracking, is_tracked
+from dadiff.store import Cache, Cell, Provenance, Record, Results, Sweep, Sweeps, store_id
+from dadiff.sync import main as dadiff_sync
+from dadiff.sync import sync
+from dadiff.tracking import Tracking
 from dadiff.tracking.client import open_client
 
 KEY = "0123456789abcdef"
@@ -35,12 +36,12 @@ def tracking(uri, tmp_path, request):
     return Tracking(uri, experiment=request.node.name, artifacts=str(tmp_path / "mlartifacts"))
 
 
-def store(root: Path, key: str = KEY):
+def store(root: Path, key: str = KEY, name: str = "lqr/known/seed=1"):
     table = pd.DataFrame({"case": [0, 0, 1, 1], "sample": 0, "t": [0, 1, 0, 1], "gap": [0.0, 2.0, 0.0, 4.0]})
     table["planned_input_error"] = [1.0, np.nan, 3.0, np.nan]
     record = Record(
         key,
-        "lqr/known/seed=1",
+        name,
         "finished",
         axes={"projector": "known", "seed": 1},
         metrics={"gap": 1.5, "cost_ratio": float("nan")},
@@ -55,14 +56,9 @@ def runs(tracking, condition=""):
     return open_client(tracking.uri).search_runs([tracking._experiment_id], condition)
 
 
-def start_and_die(tracking, root):
-    tracking.start(KEY, "dead", root)
-    os.kill(os.getpid(), signal.SIGKILL)
-
-
 def test_a_run_is_mirrored_with_curves_scalars_and_tables(tracking, tmp_path):
     run = store(tmp_path)
-    tracking.log_run(run, tracking.start(run.key, run.name, tmp_path))
+    tracking.log_run(run)
     (mirror,) = runs(tracking)
     client = open_client(tracking.uri)
     curve = client.get_metric_history(mirror.info.run_id, "t/gap")
@@ -73,7 +69,8 @@ def test_a_run_is_mirrored_with_curves_scalars_and_tables(tracking, tmp_path):
     assert mirror.data.params == {"projector": "known", "seed": "1"}
     assert mirror.info.run_name == run.name
     assert mirror.info.status == "FINISHED"
-    assert {"key", "host", "pid", "link.dataset", "version.dadiff"} <= mirror.data.tags.keys()
+    assert (mirror.info.end_time - mirror.info.start_time) == 2000
+    assert {"key", "host", "link.dataset", "version.dadiff"} <= mirror.data.tags.keys()
     assert "2 cases" in mirror.data.tags["mlflow.note.content"]
     files = {artifact.path for artifact in client.list_artifacts(mirror.info.run_id)}
     assert files == {"run.json", "config.yaml", "per_step.parquet"}
@@ -87,7 +84,19 @@ def test_nothing_is_logged_twice(tracking, tmp_path):
     assert len(open_client(tracking.uri).get_metric_history(mirror.info.run_id, "t/gap")) == 2
 
 
-def test_logging_that_was_cut_short_goes_on_in_the_same_run(tracking, tmp_path, monkeypatch, caplog):
+def test_a_failed_run_is_mirrored_as_such_until_it_is_done(tracking, tmp_path):
+    Results(tmp_path).write_failure(Record(KEY, "x", "killed", "SIGKILL"))
+    tracking.log_run(Results(tmp_path).read(KEY))
+    (failed,) = runs(tracking)
+    assert (failed.info.status, failed.data.tags["status"]) == ("KILLED", "killed")
+    assert "SIGKILL" in failed.data.tags["mlflow.note.content"]
+    tracking.log_run(store(tmp_path))
+    (mirror,) = runs(tracking)
+    assert mirror.info.status == "FINISHED"
+
+
+@pytest.mark.parametrize("place", ["create_run", "log_batch", "log_artifact", "set_terminated", "set_tag"])
+def test_logging_that_was_cut_short_is_done_again(tracking, tmp_path, monkeypatch, caplog, place):
     from mlflow import MlflowClient
     from mlflow.exceptions import MlflowException
 
@@ -96,63 +105,47 @@ def test_logging_that_was_cut_short_goes_on_in_the_same_run(tracking, tmp_path, 
 
     run = store(tmp_path)
     with monkeypatch.context() as patch:
-        patch.setattr(MlflowClient, "set_terminated", away)
+        patch.setattr(MlflowClient, place, away)
         tracking.log_run(run)
     assert "dadiff-sync or the same command uploads it" in caplog.text
-    assert not is_tracked(run.folder, tracking.uri)
     tracking.log_run(run)
     (mirror,) = runs(tracking)
     assert mirror.info.status == "FINISHED"
-    assert is_tracked(run.folder, tracking.uri)
     assert len(open_client(tracking.uri).get_metric_history(mirror.info.run_id, "t/gap")) == 2
 
 
 def test_a_result_done_again_replaces_its_mirror(tracking, tmp_path):
     tracking.log_run(store(tmp_path))
-    tracking.log_run(store(tmp_path))
-    assert len(runs(tracking)) == 1
+    tracking.log_run(store(tmp_path, name="again"))
+    (mirror,) = runs(tracking)
+    assert mirror.info.run_name == "again"
 
 
-def test_runs_of_dead_processes_are_closed_and_living_ones_are_not(tracking, tmp_path):
-    tracking.prepare()
-    process = multiprocessing.get_context("spawn").Process(target=start_and_die, args=(tracking, tmp_path))
-    process.start()
-    living = tracking.start("f" * 16, "living", tmp_path)
-    elsewhere = tracking.start("e" * 16, "elsewhere", tmp_path / "other")
-    process.join()
-    assert len(runs(tracking, "attributes.status = 'RUNNING'")) == 3
-    assert tracking.close_dead(tmp_path) == 1
-    assert {run.info.run_id for run in runs(tracking, "attributes.status = 'RUNNING'")} == {living, elsewhere}
-    (dead,) = runs(tracking, "attributes.status = 'KILLED'")
-    assert "its process is gone" in dead.data.tags["mlflow.note.content"]
+def test_output_folders_that_share_a_store_do_not_touch_each_other(tracking, tmp_path):
+    for folder in ("one", "two"):
+        tracking.log_run(store(tmp_path / folder))
+    tracking.catch_up(tmp_path / "one", [])
+    assert len(runs(tracking)) == 2
 
 
-def test_runs_of_other_hosts_are_dead_when_nobody_holds_the_lock_of_their_work(tracking, tmp_path, monkeypatch):
-    tracking.prepare()
-    other = "f" * 16
-    with monkeypatch.context() as there:
-        there.setattr("platform.node", lambda: "elsewhere")
-        living, _dead = tracking.start(KEY, "living", tmp_path), tracking.start(other, "dead", tmp_path)
-        tracking.start(other, "training/dead", tmp_path, "training")
-        sweep = tracking.start("quick", "quick", tmp_path, "sweep")
-    with Results(tmp_path).working(KEY), Sweeps(tmp_path).running("quick"):
-        assert tracking.close_dead(tmp_path) == 2
-    assert {run.info.run_id for run in runs(tracking, "attributes.status = 'RUNNING'")} == {living, sweep}
-    assert tracking.close_dead(tmp_path) == 2
-    assert len(runs(tracking, "attributes.status = 'KILLED'")) == 4
+def test_what_a_killed_process_left_running_goes_with_the_next_catching_up(tracking, tmp_path):
+    left = {"kind": "run", "key": "f" * 16, "store": store_id(tmp_path)}
+    open_client(tracking.uri).create_run(tracking._experiment_id, tags=left)
+    tracking.catch_up(tmp_path, [store(tmp_path)])
+    assert [mirror.info.status for mirror in runs(tracking)] == ["FINISHED"]
+
+
+def sweep_of(*cells: Cell, seeds: str = "1") -> Sweep:
+    return Sweep("quick", "dadiff +sweeps=quick", {"seed": seeds}, list(cells))
 
 
 def test_a_sweep_is_one_parent_however_often_it_is_run(tracking, tmp_path):
-    run = store(tmp_path)
-    cells = [Cell(run.key, run.name, run.axes, "finished"), Cell("f" * 16, "other", {}, "failed", "why")]
-    sweep = Sweep("quick", "dadiff +sweeps=quick", {"projector": "known,none"}, cells)
-    Sweeps(tmp_path).write(sweep)
-    parents = []
-    for _ in range(2):
-        parents.append(tracking.open_sweep(sweep, tmp_path))
-        child = Tracking(tracking.uri, tracking.experiment, tracking.artifacts, parent=parents[-1])
-        child.log_run(run)
-        tracking.close_sweep(parents[-1], sweep, tmp_path, "failed")
+    run, parents = store(tmp_path), []
+    cells = Cell(run.key, run.name, run.axes, "finished"), Cell("f" * 16, "other", {}, "failed", "why")
+    for status in ("waiting", "finished"):
+        Sweeps(tmp_path).write(sweep_of(Cell(run.key, run.name, run.axes, status), cells[1]))
+        parents.append(tracking.log_sweep(tmp_path, "quick"))
+        tracking.log_run(run, parents[-1])
     assert parents[0] == parents[1]
     assert len(runs(tracking)) == 2
     (parent,) = runs(tracking, "tags.kind = 'sweep'")
@@ -161,44 +154,167 @@ def test_a_sweep_is_one_parent_however_often_it_is_run(tracking, tmp_path):
     assert parent.data.tags["cells"] == "1 failed, 1 finished"
     (mirror,) = runs(tracking, f"tags.`mlflow.parentRunId` = '{parents[0]}'")
     assert mirror.info.run_name == run.name
-    table = pd.read_csv(Sweeps(tmp_path).folder("quick") / "results.csv")
-    assert list(table["gap"][:1]) == [1.5]
-    assert list(table["status"]) == ["finished", "failed"]
 
 
 def test_a_sweep_that_was_extended_shows_what_it_is_now(tracking, tmp_path):
     """MLflow refuses to change a parameter, and keeps the larger of two metrics of one step."""
-    first = [Cell("a" * 16, "a", {"seed": 0}, "failed", "why")]
-    both = [Cell("a" * 16, "a", {"seed": 0}, "finished"), Cell("b" * 16, "b", {"seed": 1}, "finished")]
-    for cells, seeds in ((first, "0"), (both, "0,1")):
-        sweep = Sweep("quick", "dadiff +sweeps=quick", {"seed": seeds}, cells)
-        Sweeps(tmp_path).write(sweep)
-        tracking.close_sweep(tracking.open_sweep(sweep, tmp_path), sweep, tmp_path, "finished")
+    first, second = Cell("a" * 16, "a", {"seed": 0}, "finished"), Cell("b" * 16, "b", {"seed": 1}, "finished")
+    for cells, seeds in (([first], "0"), ([first, second], "0,1")):
+        Sweeps(tmp_path).write(sweep_of(*cells, seeds=seeds))
+        tracking.log_sweep(tmp_path, "quick")
     (parent,) = runs(tracking, "tags.kind = 'sweep'")
     assert json.loads(parent.data.tags["definition"]) == {"seed": "0,1"}
     assert parent.data.tags["cells"] == "2 finished"
     assert "| seed | 0,1 |" in parent.data.tags["mlflow.note.content"]
     assert parent.info.status == "FINISHED"
-    assert is_tracked(Sweeps(tmp_path).folder("quick"), tracking.uri)
 
 
 def test_a_training_is_a_run_of_its_own(tracking, tmp_path):
     def build(folder: Path) -> None:
         pd.DataFrame({"step": [1, 100], "loss": [1.0, 0.1]}).to_csv(folder / "training.csv", index=False)
 
-    folder = Cache(tmp_path).get_or_build("denoiser", KEY, {"training": {"steps": 100}}, build)
+    Cache(tmp_path).get_or_build("denoiser", KEY, {"training": {"steps": 100}}, build)
     for _ in range(2):
-        tracking.log_training(folder)
+        tracking.log_training(tmp_path, KEY)
     (mirror,) = runs(tracking)
     assert mirror.data.params == {"training.steps": "100"}
     assert mirror.data.metrics == {"loss": 0.1}
-    assert Cache(tmp_path).get_or_build("denoiser", KEY, {}, build) == folder
+    tracking.log_training(tmp_path, "f" * 16)  # there is none
+    assert len(runs(tracking)) == 1
+
+
+# --- the mirror is made again from disk
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """An output folder with a sweep of two runs, one of them failed, a report of it, and its mirror."""
+    root = tmp_path_factory.mktemp("made") / "outputs"
+    run = store(root)
+    Results(root).write_failure(Record("f" * 16, "other", "failed", "why"))
+    cells = Cell(run.key, run.name, {}, "finished"), Cell("f" * 16, "other", {}, "failed", "why")
+    Sweeps(root).write(sweep_of(*cells))
+    (root / "reports" / "quick").mkdir(parents=True)
+    (root / "reports" / "quick" / "index.html").write_text("<p>report</p>")
+    assert sync(root) == 3
+    return root
+
+
+@pytest.fixture
+def outputs(made, tmp_path):
+    """A copy in another place, so that its database names files where the original lies."""
+    return Path(shutil.copytree(made, tmp_path / "outputs"))
+
+
+def shown(root: Path) -> dict[str, tuple[str, str, int]]:
+    """What MLflow says: name -> status, parent's name, number of files."""
+    tracking = Tracking.of({}, root)
+    client, found = open_client(tracking.uri), runs(tracking)
+    names = {run.info.run_id: run.info.run_name for run in found}
+    return {
+        run.info.run_name: (
+            run.info.status,
+            names.get(run.data.tags.get("mlflow.parentRunId"), ""),
+            len(client.list_artifacts(run.info.run_id)),
+        )
+        for run in found
+    }
+
+
+WHOLE = {
+    "quick": ("FAILED", "", 1),
+    "other": ("FAILED", "quick", 1),
+    "lqr/known/seed=1": ("FINISHED", "quick", 3),
+}
+
+
+def delete(database: Path) -> None:
+    for part in database.parent.glob("mlflow.db*"):
+        part.unlink()
+
+
+def empty(database: Path) -> None:
+    database.write_bytes(b"")
+
+
+def truncate(database: Path) -> None:
+    os.truncate(database, database.stat().st_size // 2)
+
+
+def cut_in_creation(database: Path) -> None:
+    with sqlite3.connect(database) as connection:
+        connection.execute("DROP TABLE alembic_version")
+
+
+def delete_in_the_pages(database: Path) -> None:
+    with sqlite3.connect(database) as connection:
+        connection.execute("UPDATE runs SET lifecycle_stage = 'deleted'")
+
+
+def delete_the_experiment(database: Path) -> None:
+    client = open_client(f"sqlite:///{database}")
+    client.delete_experiment(client.get_experiment_by_name("dadiff").experiment_id)
+
+
+def forget(database: Path) -> None:
+    with sqlite3.connect(database) as connection:
+        for table in ("tags", "metrics", "latest_metrics", "params", "runs"):
+            connection.execute(f"DELETE FROM {table}")
+
+
+@pytest.mark.parametrize(
+    ("harm", "missing"),
+    [
+        (delete, 3),
+        (empty, 3),
+        (truncate, 3),
+        (cut_in_creation, 3),
+        (delete_in_the_pages, 3),
+        (forget, 3),
+        (delete_the_experiment, 0),  # which MLflow restores with its runs
+    ],
+)
+def test_a_mirror_is_made_again_from_disk_whatever_became_of_it(outputs, harm, missing, capsys):
+    sync(outputs)
+    harm(outputs / "mlflow.db")
+    assert dadiff_sync(["--output-dir", str(outputs)]) == 0
+    assert capsys.readouterr().out == f"{missing} were missing in MLflow and are there now\n"
+    assert shown(outputs) == WHOLE
+    assert sync(outputs) == 0
+
+
+def test_a_mirror_in_a_folder_that_was_moved_is_made_again_there(outputs):
+    assert (sync(outputs), sync(outputs)) == (3, 0)
+    assert shown(outputs) == WHOLE
+    tracking = Tracking.of({}, outputs)
+    (sweep,) = runs(tracking, "tags.kind = 'sweep'")
+    assert Path(sweep.info.artifact_uri).is_relative_to(outputs)
+    files = open_client(tracking.uri).list_artifacts(sweep.info.run_id, "report")
+    assert [file.path for file in files] == ["report/index.html"]
+
+
+def test_syncing_to_another_store_leaves_the_first(outputs, tmp_path):
+    uri = f"sqlite:///{tmp_path}/other/mlflow.db"
+    sync(outputs)
+    assert (sync(outputs, uri), sync(outputs, uri), sync(outputs)) == (3, 0, 0)
+
+
+def test_a_stored_configuration_finds_its_store_where_the_folder_was_moved():
+    config = {
+        "output_dir": "/old/outputs",
+        "tracking": {
+            "_target_": "dadiff.tracking.Tracking", "uri": "sqlite:////old/outputs/mlflow.db",
+            "artifacts": "/old/outputs/mlartifacts", "experiment": "mine", "parent": "of an older version",
+        },
+    }  # fmt: skip
+    expected = Tracking("sqlite:////new/place/mlflow.db", "mine", "/new/place/mlartifacts")
+    assert Tracking.of(config, "/new/place") == expected
 
 
 def test_a_server_that_is_away_is_an_error_at_the_start_and_a_warning_later(tmp_path, caplog):
-    tracking = Tracking("http://127.0.0.1:9", experiment="x")
+    tracking = Tracking("http://me:secret@127.0.0.1:9", experiment="x")
     start = time.monotonic()
-    with pytest.raises(StoreError, match=r"127.0.0.1:9 does not answer .*tracking=sqlite"):
+    with pytest.raises(StoreError, match=r"http://me@127.0.0.1:9 does not answer .*tracking=sqlite"):
         tracking.prepare()
     assert time.monotonic() - start < 10
     with caplog.at_level(logging.WARNING):
@@ -214,18 +330,34 @@ def test_the_store_is_absolute_and_writes_ahead(tracking, tmp_path, monkeypatch)
         assert connection.execute("PRAGMA journal_mode").fetchone() == ("wal",)
 
 
-def test_a_damaged_database_is_one_clear_line(tmp_path):
-    (tmp_path / "mlflow.db").write_text("this is not a database, though it is long enough to look like one" * 20)
+def test_what_is_no_database_of_ours_is_left_alone(tmp_path):
+    path = tmp_path / "mlflow.db"
+    path.write_text("this is not a database, though it is long enough to look like one" * 20)
     with pytest.raises(StoreError, match="cannot be opened as a database"):
-        Tracking(f"sqlite:///{tmp_path}/mlflow.db").prepare()
+        Tracking(f"sqlite:///{path}").prepare()
+    path.unlink()
+    with sqlite3.connect(path) as connection:
+        connection.execute("CREATE TABLE mine (x)")
+    with pytest.raises(StoreError, match="not of MLflow's"):
+        Tracking(f"sqlite:///{path}").prepare()
+
+
+def test_a_database_is_made_aside_and_put_in_its_place(tmp_path, monkeypatch):
+    path, killed = tmp_path / "mlflow.db", KeyboardInterrupt
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "rename", lambda *_: (_ for _ in ()).throw(killed))
+        with pytest.raises(killed):
+            Tracking(f"sqlite:///{path}").prepare()
+    assert not path.exists()
+    Tracking(f"sqlite:///{path}").prepare()
+    assert {part.name for part in tmp_path.iterdir()} <= {f"mlflow.db{end}" for end in ("", ".lock", "-wal", "-shm")}
 
 
 def test_tracking_can_be_off_and_refuses_unknown_stores(tmp_path):
     off = Tracking("sqlite:///x.db", enabled=False)
     off.prepare()
-    assert off.start(KEY, "x", tmp_path) is None
-    assert off.close_dead(tmp_path) == 0
     off.log_run(store(tmp_path))
+    assert off.catch_up(tmp_path, [store(tmp_path)]) == 0
     assert not Path("x.db").exists()
     with pytest.raises(ConfigError, match="uri is 'file:"):
         Tracking("file:///tmp/mlruns")

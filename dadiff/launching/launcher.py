@@ -7,7 +7,9 @@ import signal
 import sys
 from abc import abstractmethod
 from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -69,8 +71,6 @@ class SweepLauncher(Launcher):
         name = self.sweep or self.config.hydra.runtime.choices.get("sweeps")
         _conceal(Path(plan.cells[0].config["output_dir"]) / "multirun.yaml")
         run = SweepRun.of(plan, name, "dadiff " + shlex.join(sys.argv[1:]), definition(self.config))
-        if run.is_over():
-            return _say_over(run)
         with Sweeps(run.output_dir).running(run.name) as lease:
             return self._run(run, lease)
 
@@ -79,8 +79,8 @@ class SweepLauncher(Launcher):
         skipped = len(run.plan.cells) - len(run.plan.waiting)
         pool = self.pool(run, lease) if run.plan.waiting else None
         parent = run.open()
-        works = run.works(parent)
-        watch = Watch(run, Table(sys.stderr, len(works), skipped))
+        works = run.works()
+        watch = Watch(run, parent, Table(sys.stderr, len(works), skipped))
         interrupted = False
         if skipped:
             sys.stderr.write(f"{skipped} of {len(run.plan.cells)} cells are done already: skipped\n")
@@ -90,18 +90,24 @@ class SweepLauncher(Launcher):
                     pool.run(works, watch)
         except KeyboardInterrupt:
             interrupted = True
-        watch.table.close()
-        sweep = run.close(parent, watch.outcomes, interrupted=interrupted)
+        watch.close()
+        sweep = run.close(watch.outcomes, interrupted=interrupted)
         sys.stderr.write(f"{summary(sweep, skipped, run.folder)}\n{run.tracking.how_to_look(run.name)}\n")
         return 130 if interrupted else int(any(cell.status not in DONE for cell in sweep.cells))
 
 
 class Watch:
-    """Follows a sweep's work: draws it, records failures at once, and keeps how each piece ended."""
+    """Follows a sweep's work: draws it, records failures at once, mirrors what ended beside the work that goes on.
 
-    def __init__(self, run: SweepRun, table: Table) -> None:
+    Args:
+        parent: the MLflow run of the sweep.
+    """
+
+    def __init__(self, run: SweepRun, parent: str | None, table: Table) -> None:
         self.table, self.outcomes = table, dict[str, Outcome]()
         self._run, self._cells = run, {cell.identity.key: cell for cell in run.plan.cells}
+        self._mirror = partial(run.mirror, parent=parent)
+        self._uploads, self._uploader = list[Future[None]](), ThreadPoolExecutor(1, "mlflow")
 
     def ended(self, work: Work, outcome: Outcome) -> None:
         """Work ended."""
@@ -109,10 +115,18 @@ class Watch:
         self.table.ended(work, outcome)
         if work.key in self._cells:
             self._run.ended(self._cells[work.key], outcome)
+        self._uploads.append(self._uploader.submit(self._mirror, work.key))
 
     def tick(self, running: Sequence[Running]) -> None:
         """Time has passed."""
         self.table.tick(running)
+
+    def close(self) -> None:
+        """Wait for what is being mirrored."""
+        self.table.close()
+        for upload in self._uploads:
+            upload.result()
+        self._uploader.shutdown()
 
 
 def definition(config: DictConfig) -> dict[str, str]:
@@ -120,11 +134,6 @@ def definition(config: DictConfig) -> dict[str, str]:
     given = (str(override).partition("=") for override in config.hydra.overrides.task)
     params = {str(name): str(value) for name, value in (config.hydra.sweeper.get("params") or {}).items()}
     return params | {name.lstrip("+~"): value for name, _, value in given}
-
-
-def _say_over(run: SweepRun) -> int:
-    sys.stderr.write(f"{run.name}: all {len(run.plan.cells)} cells are done already (force=true runs them again)\n")
-    return 0
 
 
 def _conceal(path: Path) -> None:

@@ -1,25 +1,24 @@
 """A multirun from its configurations to its summary, whatever runs its jobs.
 
-plan -> store and sweep.json -> MLflow's parent run -> jobs -> failures recorded -> sweep.json, MLflow, summary
+plan -> MLflow's store -> sweep.json and its mirror -> jobs, each mirrored as it ends -> sweep.json, mirror, summary
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from dadiff.launching import jobs
 from dadiff.launching.outcome import Outcome
 from dadiff.launching.plan import Plan, PlannedCell, Preparation
 from dadiff.launching.work import Work
 from dadiff.running.identity import digest
-from dadiff.store import DONE, Cache, Cell, Results, Sweep, Sweeps
-from dadiff.tracking import Tracking, is_tracked
-
-BUILDERS = {"demonstrations": jobs.build_demonstrations, "denoiser": jobs.train, "cases": jobs.build_cases}
+from dadiff.store import DONE, Cell, Results, Sweep, Sweeps
+from dadiff.tracking import Tracking
+from dadiff.tracking.client import spared
+from dadiff.tracking.content import results_table
 
 
 @dataclass(frozen=True)
@@ -45,71 +44,49 @@ class SweepRun:
         config = plan.cells[0].config
         made = f"multirun-{digest(sorted(cell.identity.key for cell in plan.cells))[:8]}"
         output_dir = Path(config["output_dir"]).absolute()
-        return cls(plan, name or made, command, definition, output_dir, jobs.tracking_of(config))
+        return cls(plan, name or made, command, definition, output_dir, Tracking.of(config, output_dir))
 
     @property
     def folder(self) -> Path:
         """Where the sweep's record and logs lie."""
         return Sweeps(self.output_dir).folder(self.name)
 
-    def is_over(self) -> bool:
-        """Whether every cell is done and everything is in MLflow, so that there is nothing to do."""
-        if self.plan.waiting or not (self.folder / "sweep.json").is_file():
-            return False
-        results, uri = Results(self.output_dir), self.tracking.uri
-        folders = [self.folder, *(results.folder(cell.identity.key) for cell in self.plan.cells)]
-        return not self.tracking.enabled or (
-            Sweeps(self.output_dir).read(self.name).cells == self.cells() and all(is_tracked(f, uri) for f in folders)
-        )
-
     def open(self) -> str | None:
-        """Write the sweep's record, close what a killed predecessor left in MLflow, open the sweep's run there.
+        """Write the sweep's record and mirror it. Returns the MLflow run that its runs are nested under.
 
         Raises:
             StoreError: if results cannot be written or the MLflow store is away.
         """
         self.tracking.prepare()
-        sweep = self.record(self.cells())
-        Sweeps(self.output_dir).write(sweep)
-        self.tracking.close_dead(self.output_dir)
-        return self.tracking.open_sweep(sweep, self.output_dir)
+        Sweeps(self.output_dir).write(self.record(self.cells()))
+        return self.tracking.log_sweep(self.output_dir, self.name)
 
-    def works(self, parent: str | None) -> list[Work]:
+    def works(self) -> list[Work]:
         """What is to be done: data sets and trainings first, cells after what they need."""
-        return [
-            *(self._preparation(preparation, parent) for preparation in self.plan.preparations),
-            *(self._run(cell, parent) for cell in self.plan.waiting),
-        ]
+        return [*map(self._preparation, self.plan.preparations), *map(self._run, self.plan.waiting)]
 
     def ended(self, cell: PlannedCell, outcome: Outcome) -> None:
         """Record a cell's failure on disk, beside the results of the others."""
         if outcome.status != "finished":
             jobs.record_end(cell.identity, cell.config, outcome.status, outcome.reason or outcome.status)
 
-    def close(self, parent: str | None, outcomes: Mapping[str, Outcome], *, interrupted: bool) -> Sweep:
-        """Bring the sweep's record and MLflow up to date. Returns the record."""
-        sweep = self.record(self.cells(outcomes, "interrupted" if interrupted else "waiting"))
-        Sweeps(self.output_dir).write(sweep)
-        self.catch_up(parent)
-        self.tracking.close_dead(self.output_dir)
-        ended = all(cell.status in DONE for cell in sweep.cells)
-        status = "finished" if ended else "interrupted" if interrupted else "failed"
-        self.tracking.close_sweep(parent, sweep, self.output_dir, status)
-        return sweep
+    def mirror(self, key: str, parent: str | None) -> None:
+        """Mirror what ended into MLflow: a cell or a training."""
+        if any(preparation.artefact.key == key for preparation in self.plan.preparations):
+            self.tracking.log_training(self.output_dir, key)
+        elif (results := Results(self.output_dir)).status(key) is not None:
+            self.tracking.log_run(results.read(key), parent)
 
-    def catch_up(self, parent: str | None) -> None:
-        """Mirror what is done and not in MLflow yet."""
-        results, cache, tracking = (
-            Results(self.output_dir),
-            Cache(self.output_dir),
-            replace(self.tracking, parent=parent),
-        )
-        for cell in self.plan.cells:
-            denoiser = cell.identity.denoiser
-            if denoiser and cache.contains("denoiser", denoiser.key):
-                tracking.log_training(cache.folder("denoiser", denoiser.key))
-            if results.is_done(cell.identity.key):
-                tracking.log_run(results.read(cell.identity.key))
+    def close(self, outcomes: Mapping[str, Outcome], *, interrupted: bool) -> Sweep:
+        """Bring the sweep's record, its table and MLflow up to date. Returns the record."""
+        results, sweeps = Results(self.output_dir), Sweeps(self.output_dir)
+        sweep = self.record(self.cells(outcomes, "interrupted" if interrupted else "waiting"))
+        sweeps.write(sweep)
+        results_table(sweep, results).to_csv(sweeps.folder(self.name) / "results.csv", index=False)
+        stored = [results.read(cell.key) for cell in sweep.cells if results.status(cell.key) is not None]
+        with spared(self.name):
+            self.tracking.catch_up(self.output_dir, stored, [self.name])
+        return sweep
 
     def record(self, cells: Sequence[Cell]) -> Sweep:
         """The sweep as stored."""
@@ -130,30 +107,16 @@ class SweepRun:
         stored = results.read(identity.key)
         return Cell(identity.key, identity.name, identity.axes, stored.status, stored.record.reason)
 
-    def _preparation(self, preparation: Preparation, parent: str | None) -> Work:
+    def _preparation(self, preparation: Preparation) -> Work:
         artefact = preparation.artefact
-        function = BUILDERS[artefact.kind]
         log_file = self.folder / "logs" / f"{artefact.kind}-{artefact.key}.log"
-        config = _with_parent(preparation.config, parent)
-        return Work(
-            artefact.key,
-            preparation.name,
-            function,
-            (config,),
-            log_file,
-            preparation.needs,
-            artefact.kind == "denoiser",
-        )
+        arguments, alone = (preparation.config, artefact.kind), artefact.kind == "denoiser"
+        return Work(artefact.key, preparation.name, jobs.build, arguments, log_file, preparation.needs, alone)
 
-    def _run(self, cell: PlannedCell, parent: str | None) -> Work:
+    def _run(self, cell: PlannedCell) -> Work:
         key = cell.identity.key
-        config = _with_parent(cell.config, parent)
         log_file = self.folder / "logs" / f"{key}.log"
-        return Work(key, cell.identity.name, jobs.run, (config,), log_file, self.plan.needs(cell))
-
-
-def _with_parent(config: Mapping[str, Any], parent: str | None) -> dict[str, Any]:
-    return {**config, "tracking": {**config["tracking"], "parent": parent}}
+        return Work(key, cell.identity.name, jobs.run, (cell.config,), log_file, self.plan.needs(cell))
 
 
 def summary(sweep: Sweep, skipped: int, folder: Path) -> str:

@@ -10,8 +10,8 @@ import tempfile
 from pathlib import Path
 
 from dadiff.errors import DadiffError
-from dadiff.store import Sweeps
-from dadiff.tracking import attach
+from dadiff.store import Results, Sweeps
+from dadiff.tracking import Tracking
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -26,6 +26,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--tracking-uri", help="read an MLflow parent run or experiment of that name from there instead"
     )
+    parser.add_argument("--log", action="store_true", help="add the report to the sweep in MLflow")
     return parser
 
 
@@ -43,11 +44,11 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def write(options: argparse.Namespace) -> Path:
-    """Write the report of what lies in the results folder, and add it to MLflow; or of what MLflow holds."""
+    """Write the report of what lies in the results folder, and add it to MLflow if asked; or of what MLflow holds."""
     if options.tracking_uri is None:
         index = _write(options, options.output_dir)
-        for name in options.sweep:
-            attach(Sweeps(options.output_dir).folder(name), [index, index.with_name("report.json")], "report")
+        for name in options.sweep if options.log else []:
+            _log(options.output_dir, name)
         return index
     from dadiff.tracking.download import download
 
@@ -55,6 +56,14 @@ def write(options: argparse.Namespace) -> Path:
         for name in options.sweep:
             download(options.tracking_uri, name, Path(folder))
         return _write(options, Path(folder))
+
+
+def _log(output_dir: Path, name: str) -> None:
+    """Mirror the sweep with its report into the store that its runs are in."""
+    results, cells = Results(output_dir), Sweeps(output_dir).read(name).cells
+    stored = [results.read(cell.key) for cell in cells if results.is_done(cell.key)]
+    for run in stored[:1]:
+        Tracking.of(run.record.config, output_dir).log_sweep(output_dir, name)
 
 
 def _write(options: argparse.Namespace, source: Path) -> Path:
@@ -77,13 +86,13 @@ def _write(options: argparse.Namespace, source: Path) -> Path:
 
 def _again(options: argparse.Namespace, definition: str) -> str:
     """The command that writes the report again from the same results."""
-    from dadiff.reporting.sources import without_password
+    from dadiff.outside import without_passwords
 
     command = ["dadiff-report", *options.sweep, "--definition", definition]
     if options.output_dir != Path("outputs"):
         command += ["--output-dir", str(options.output_dir)]
     if options.tracking_uri is not None:
-        command += ["--tracking-uri", without_password(options.tracking_uri)]
+        command += ["--tracking-uri", without_passwords(options.tracking_uri)]
     return shlex.join(command)
 
 

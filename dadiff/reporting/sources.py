@@ -18,10 +18,7 @@ import pandas as pd
 from dadiff.errors import StoreError
 from dadiff.store import Record, Results, StoredRun, Sweeps
 from dadiff.store.results import read_table
-from dadiff.tracking.markers import MARKER, read_markers
-
-LOCAL_UI = "http://127.0.0.1:5000"
-"""Where `mlflow ui` answers."""
+from dadiff.tracking.links import pages
 
 
 @lru_cache(maxsize=64)
@@ -34,17 +31,6 @@ def _columns(folder: Path, name: str) -> tuple[str, ...]:
     return tuple(_table(folder, name).columns)
 
 
-def without_password(uri: str) -> str:
-    """A uri as it may be shown."""
-    scheme, there, rest = uri.partition("://")
-    host, slash, path = rest.partition("/")
-    return f"{scheme}{there}{host.rpartition('@')[2]}{slash}{path}"
-
-
-def _server(uri: str) -> str:
-    return without_password(uri).rstrip("/") if uri.startswith(("http://", "https://")) else LOCAL_UI
-
-
 @dataclass(frozen=True)
 class Cell:
     """One cell of a sweep, with its stored run if there is one.
@@ -55,6 +41,7 @@ class Cell:
         axes: flat parameters; those that are null do not apply.
         run: None if nothing was stored.
         waiting: what the sweep's record says of a cell without a run.
+        mlflow: its page in MLflow.
         means: over the plans of each case, of the tables and metrics that were asked for.
     """
 
@@ -63,6 +50,7 @@ class Cell:
     axes: dict[str, Any]
     run: StoredRun | None = field(repr=False)
     waiting: str | None = None
+    mlflow: str | None = None
     means: dict[tuple[str, str], np.ndarray] = field(default_factory=dict, repr=False, compare=False)
 
     @property
@@ -96,15 +84,6 @@ class Cell:
         if self.record and self.status == "diverged" and self.record.diverged_step is not None:
             return f"diverged at step {self.record.diverged_step}"
         return f"{self.status}: {reason}" if reason else self.status
-
-    @property
-    def mlflow(self) -> list[str]:
-        """Pages of the run in MLflow; of a store that is a file, in the UI that is opened on it."""
-        path = self.run.folder / MARKER if self.run else None
-        if path is None or not path.is_file():
-            return []
-        stores = read_markers(path.parent).items()
-        return [f"{_server(uri)}/#/experiments/{m.experiment_id}/runs/{m.run_id}" for uri, m in stores]
 
     @property
     def metrics(self) -> Mapping[str, float]:
@@ -185,9 +164,11 @@ def _read(output_dir: Path, name: str) -> Sweep:
             f"{sweeps.root}: holds no sweep {name!r}; found {', '.join(sweeps.names()) or 'none'}; "
             f"run `dadiff +sweeps={name}` or give another --output-dir"
         )
-    stored, cells = sweeps.read(name), []
+    stored, cells, links = sweeps.read(name), [], pages(output_dir)
     for cell in stored.cells:
         run = results.read(cell.key) if results.status(cell.key) else None
         waiting = None if run else cell.reason or (cell.status if cell.status != "waiting" else None)
-        cells.append(Cell(cell.key, cell.name, {**cell.axes, **(run.axes if run else {})}, run, waiting))
+        cells.append(
+            Cell(cell.key, cell.name, {**cell.axes, **(run.axes if run else {})}, run, waiting, links.get(cell.key))
+        )
     return Sweep(stored.name, stored.command, cells)

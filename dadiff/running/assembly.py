@@ -16,8 +16,7 @@ from dadiff.denoisers.recipes import ExactRecipe, Recipe
 from dadiff.diffusion.estimate import Estimate
 from dadiff.errors import ConfigError
 from dadiff.experts.lqr import GaussianLaw
-from dadiff.planning import Planner
-from dadiff.running.identity import Artefact, Identity, identity_of
+from dadiff.running.identity import Artefact, Identity, Shared, identity_of
 from dadiff.running.parts import Parts
 from dadiff.store import Cache, Results
 from dadiff.systems import System
@@ -30,6 +29,7 @@ from dadiff.trajectory.layout import Layout, TrajectoryLayout
 if TYPE_CHECKING:
     from dadiff.denoisers.encoded import EncodedDenoiser
     from dadiff.denoisers.learned import NetworkDenoiser
+    from dadiff.planning import Planner
 
 
 @dataclass(frozen=True)
@@ -164,6 +164,8 @@ class Experiment:
     @cached_property
     def planner(self) -> Planner:
         """All of it as one thing that plans."""
+        from dadiff.planning import Planner
+
         behaviour = self.behaviour  # before the denoiser is trained, since it may refuse what it is given
         return Planner(
             self.parts.task,
@@ -189,9 +191,14 @@ class Experiment:
             return Estimate.of_covariance(self.layout, where, shown.trajectories, covariance)
         return Estimate.of_demonstrations(self.layout, where, shown.trajectories, shown.environment)
 
-    def prepare(self) -> None:
-        """Build what is shared with other runs."""
-        _ = self.demonstrations, self.cases, self.denoiser
+    @property
+    def is_done(self) -> bool:
+        """Whether there is a result that is only to be read."""
+        return not self.parts.settings.force and self.results.is_done(self.identity.key)
+
+    def build(self, kind: Shared) -> None:
+        """Build something that is shared with other runs, unless it is cached."""
+        getattr(self, kind)
 
     @cached_property
     def law(self) -> GaussianLaw:

@@ -75,7 +75,7 @@ def execute(experiment: Experiment) -> StoredRun:
     """
     results, key = experiment.results, experiment.identity.key
     with results.working(key):
-        if results.is_done(key) and not experiment.parts.settings.force:
+        if experiment.is_done:
             return results.read(key)
         started = time.time()
         plans = draw_plans(experiment)

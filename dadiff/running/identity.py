@@ -12,7 +12,7 @@ import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 from dadiff.behaviours import NoProjector
 from dadiff.config import GROUPS
@@ -24,16 +24,18 @@ from dadiff.tasks.encodings import Plain
 
 FORMAT = 2  # raised whenever a change moves results; see CHANGELOG
 
+Shared = Literal["demonstrations", "denoiser", "cases"]
+
 
 @dataclass(frozen=True)
 class Artefact:
     """Something shared by runs: its kind, what determines it, and the hash of that.
 
     Args:
-        kind: "demonstrations", "cases" or "denoiser", which are cached; or "recording", which is cheap.
+        kind: what is shared is cached; a recording is cheap.
     """
 
-    kind: str
+    kind: Shared | Literal["recording"]
     determined_by: dict[str, Any]
 
     @property

@@ -1,5 +1,5 @@
-"""Everything that talks to MLflow. Results are on disk first; MLflow mirrors them."""
+"""Everything that talks to MLflow. Results are on disk first; MLflow mirrors them, and is made again from them."""
 
-from dadiff.tracking.tracking import Tracking, attach, is_tracked
+from dadiff.tracking.tracking import Tracking
 
-__all__ = ["Tracking", "attach", "is_tracked"]
+__all__ = ["Tracking"]

@@ -1,24 +1,22 @@
-"""The doorway to MLflow: its settings, its store made once, and who of its running runs is dead.
-
-Several processes that open an SQL store which does not exist yet break it for good, so it is made under a lock.
-"""
+"""The doorway to MLflow: its settings, its store made by one process at a time, and its errors in one line."""
 
 from __future__ import annotations
 
 import hashlib
 import logging
 import os
-import sqlite3
 import tempfile
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dadiff.errors import StoreError
-from dadiff.store.files import locked, make_folder
+from dadiff.outside import without_passwords
+from dadiff.store.files import locked
+from dadiff.tracking.database import SQLITE, prepare_database
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -31,7 +29,6 @@ SETTINGS = {
     "MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR": "false",
 }
 EXPERIMENT_TAGS = {"mlflow.experimentKind": "custom_model_development"}  # the pages for training, not for chats
-SQLITE = "sqlite:///"
 PROBE_SECONDS = 5
 
 log = logging.getLogger(__name__)
@@ -39,13 +36,17 @@ log = logging.getLogger(__name__)
 
 def open_client(uri: str) -> MlflowClient:
     """A client of the store. The first one in a process imports MLflow, which takes seconds."""
-    for name, value in SETTINGS.items():
-        os.environ.setdefault(name, value)
+    _set_up()
     from mlflow import MlflowClient
 
+    return MlflowClient(tracking_uri=uri)
+
+
+def _set_up() -> None:
+    for name, value in SETTINGS.items():
+        os.environ.setdefault(name, value)
     for name in ("mlflow.store.db.utils", "alembic", "alembic.runtime.migration"):
         logging.getLogger(name).setLevel(logging.WARNING)
-    return MlflowClient(tracking_uri=uri)
 
 
 def prepare_store(uri: str, experiment: str, artifacts: str | None) -> str:
@@ -56,9 +57,10 @@ def prepare_store(uri: str, experiment: str, artifacts: str | None) -> str:
     """
     if uri.startswith(("http://", "https://")):
         _probe(uri)
-    with locked(_lock_file(uri), f"the MLflow store {uri}"):
+    with locked(_lock_file(uri), f"the MLflow store {without_passwords(uri)}"):
         if uri.startswith(SQLITE):
-            _write_ahead(Path(uri.removeprefix(SQLITE)))
+            _set_up()
+            prepare_database(Path(uri.removeprefix(SQLITE)), experiment, artifacts)
         with refused(uri):
             return _experiment_id(open_client(uri), experiment, None if uri.startswith("http") else artifacts)
 
@@ -86,23 +88,9 @@ def _probe(uri: str) -> None:
     except OSError as error:
         answer = str(getattr(error, "reason", error))
     raise StoreError(
-        f"tracking: the MLflow server {uri} does not answer ({answer}); "
+        f"tracking: the MLflow server {without_passwords(uri)} does not answer ({answer}); "
         "start it, mend tracking.uri, or take tracking=sqlite"
     )
-
-
-def _write_ahead(path: Path) -> None:
-    """Switch the database to its write-ahead log, in which readers and writers do not block each other.
-
-    Raises:
-        StoreError: if the file cannot be opened as a database.
-    """
-    make_folder(path.parent)
-    try:
-        with closing(sqlite3.connect(path, timeout=60)) as connection:
-            connection.execute("PRAGMA journal_mode=WAL")
-    except sqlite3.DatabaseError as error:
-        raise StoreError(f"tracking: {path} cannot be opened as a database ({error}); move it away") from error
 
 
 def _lock_file(uri: str) -> Path:
@@ -131,7 +119,7 @@ def refused(uri: str) -> Iterator[None]:
         yield
     except failures() as error:
         raise StoreError(
-            f"tracking: the MLflow store {uri} refuses ({first_line(error)}); mend tracking.uri"
+            f"tracking: the MLflow store {without_passwords(uri)} refuses ({first_line(error)}); mend tracking.uri"
         ) from error
 
 
@@ -152,22 +140,3 @@ def first_line(error: BaseException) -> str:
     """The first line of an error's message, or its type's name."""
     lines = str(error).strip().splitlines()
     return lines[0][:200] if lines else type(error).__name__
-
-
-def process_start(pid: int) -> str | None:
-    """When a living process started (clock ticks since boot), so that a reused pid is seen; None if it is gone."""
-    try:
-        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    except OSError:
-        return None if Path("/proc/self").exists() else _start_without_proc(pid)
-    return None if fields[0] == "Z" else fields[19]
-
-
-def _start_without_proc(pid: int) -> str | None:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return None
-    except PermissionError:
-        return "unknown"
-    return "unknown"

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dadiff.outside import spreadsheet_safe
-from dadiff.store import Results, StoredRun, Sweep
+from dadiff.store import DONE, Cache, Results, StoredRun, Sweep, Sweeps
+from dadiff.store.cache import MANIFEST
+from dadiff.store.files import checksum, read_json
+from dadiff.store.results import RECORD
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -30,12 +35,16 @@ OVER_TIME = "t/"
 ARTIFACTS = (".json", ".yaml", ".parquet", ".csv", ".png", ".svg", ".pdf")
 
 
+MLFLOW_STATUS = {"killed": "KILLED", "interrupted": "KILLED"}
+
+
 @dataclass(frozen=True)
 class Content:
     """What is logged of one run.
 
     Args:
         metrics: (name, value, step), finite values only.
+        files: folder among the artifacts ("" is their top) -> files.
         started, time: of the work and of all metrics, in ms since 1970; from the record, so that logging again
             changes nothing; None and 0 where that is not recorded.
     """
@@ -43,9 +52,69 @@ class Content:
     params: dict[str, str] = field(default_factory=dict)
     metrics: list[tuple[str, float, int]] = field(default_factory=list)
     tags: dict[str, str] = field(default_factory=dict)
-    files: list[Path] = field(default_factory=list)
+    files: dict[str, list[Path]] = field(default_factory=dict)
     started: int | None = None
     time: int = 0
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Something on disk that one MLflow run mirrors.
+
+    Args:
+        kind: "sweep", "training" or "run".
+        key: names it among its kind.
+        stamp: changes whenever what lies on disk changes.
+        status: as MLflow has it.
+        read: reads what is logged of it.
+    """
+
+    kind: str
+    key: str
+    name: str
+    stamp: str
+    status: str
+    read: Callable[[], Content] = field(repr=False, compare=False)
+
+
+def run_piece(run: StoredRun) -> Piece:
+    """A stored run, whether it is a result or failed."""
+    status = "FINISHED" if run.record.is_done else MLFLOW_STATUS.get(run.status, "FAILED")
+    return Piece("run", run.key, run.name, _stamp(run.folder / RECORD), status, partial(run_content, run))
+
+
+def training_piece(output_dir: Path | str, key: str) -> Piece | None:
+    """A training in the cache; None if there is none of this key."""
+    folder = Cache(output_dir).folder("denoiser", key)
+    if not (folder / MANIFEST).is_file():
+        return None
+    read = partial(training_content, folder)
+    return Piece("training", key, f"training/{key}", _stamp(folder / MANIFEST), "FINISHED", read)
+
+
+def sweep_piece(output_dir: Path | str, name: str) -> Piece:
+    """A stored sweep, with its table and its report if there is one."""
+    folder = Sweeps(output_dir).folder(name)
+    files = [folder / "sweep.json", *_report(output_dir, name)]
+    statuses = {cell.status for cell in Sweeps(output_dir).read(name).cells}
+    return Piece("sweep", name, name, _stamp(*files), _sweep_status(statuses), partial(sweep_content, output_dir, name))
+
+
+def _sweep_status(statuses: set[str]) -> str:
+    if statuses <= set(DONE):
+        return "FINISHED"
+    if "waiting" in statuses:
+        return "SCHEDULED"
+    return "KILLED" if "interrupted" in statuses else "FAILED"
+
+
+def _report(output_dir: Path | str, name: str) -> list[Path]:
+    files = [Path(output_dir) / "reports" / name / part for part in ("index.html", "report.json")]
+    return [file for file in files if file.is_file()]
+
+
+def _stamp(*files: Path) -> str:
+    return hashlib.sha256("".join(map(checksum, files)).encode()).hexdigest()[:16]
 
 
 def run_content(run: StoredRun) -> Content:
@@ -60,7 +129,9 @@ def run_content(run: StoredRun) -> Content:
         "mlflow.note.content": run_note(run),
     }
     params = {name: _text(value) for name, value in run.axes.items()}
-    return Content(params, scalars(run) + curves(run), tags, artifacts(run.folder), *times(made.started, made.seconds))
+    return Content(
+        params, scalars(run) + curves(run), tags, {"": artifacts(run.folder)}, *times(made.started, made.seconds)
+    )
 
 
 def scalars(run: StoredRun) -> list[tuple[str, float, int]]:
@@ -99,10 +170,11 @@ def run_note(run: StoredRun) -> str:
     return "\n\n".join(lines)
 
 
-def training_content(manifest: dict[str, Any], folder: Path) -> Content:
+def training_content(folder: Path) -> Content:
     """A cached training: its identity as parameters, its curve (`training.csv`: step, loss, ...) as metrics."""
     import pandas as pd
 
+    manifest = read_json(folder / MANIFEST)
     identity = flat(manifest.get("identity", {}))
     path = folder / "training.csv"
     metrics = []
@@ -111,14 +183,15 @@ def training_content(manifest: dict[str, Any], folder: Path) -> Content:
     note = f"Training of the denoiser `{manifest['key']}`, shared by every run whose tag `link.denoiser` names it."
     tags = {"status": "finished", "mlflow.note.content": f"{note}\n\nThe weights lie in `{folder}`."}
     params = {name: _text(value) for name, value in identity.items()}
-    return Content(params, metrics, tags, artifacts(folder), *times(manifest.get("created")))
+    return Content(params, metrics, tags, {"": artifacts(folder)}, *times(manifest.get("created")))
 
 
-def sweep_content(sweep: Sweep, table_file: Path) -> Content:
+def sweep_content(output_dir: Path | str, name: str) -> Content:
     """A sweep: what it ranges over, how many cells ended how, its table of results.
 
     All in tags, which may change: parameters and metrics of MLflow keep what the first of several starts said.
     """
+    sweep = Sweeps(output_dir).read(name)
     counts = Counter(cell.status for cell in sweep.cells)
     failed = [f"- {cell.name}: {cell.status}, {cell.reason}" for cell in sweep.cells if cell.reason]
     note = [
@@ -135,7 +208,9 @@ def sweep_content(sweep: Sweep, table_file: Path) -> Content:
         "definition": json.dumps({name: _text(value) for name, value in sweep.definition.items()}),
         "cells": ", ".join(f"{count} {status}" for status, count in sorted(counts.items())),
     }
-    return Content(tags=tags, files=[table_file])
+    table = Sweeps(output_dir).folder(name) / "results.csv"
+    files = {"": [table] if table.is_file() else [], "report": _report(output_dir, name)}
+    return Content(tags=tags, files=files)
 
 
 def sweep_view(sweep: Sweep, parent: str) -> str:
@@ -178,7 +253,7 @@ def results_table(sweep: Sweep, results: Results) -> pd.DataFrame:
 
 def artifacts(folder: Path) -> list[Path]:
     """The files worth having in MLflow: tables, figures and descriptions, not weights and arrays."""
-    return sorted(p for p in folder.iterdir() if p.suffix in ARTIFACTS and p.name != "tracking.json")
+    return sorted(p for p in folder.iterdir() if p.suffix in ARTIFACTS)
 
 
 def flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -12,9 +12,11 @@ from typing import TYPE_CHECKING
 from dadiff.errors import StoreError
 from dadiff.store import Cell, Results, Sweep, Sweeps
 from dadiff.store.files import make_folder
+from dadiff.store.names import file_name, key_of
 from dadiff.store.record import read_record
 from dadiff.store.results import RECORD
 from dadiff.tracking.client import open_client, refused
+from dadiff.tracking.mirror import search
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -53,19 +55,15 @@ def _find(client: MlflowClient, name: str) -> tuple[list[Run], dict[str, str], s
 
 
 def _all(client: MlflowClient, experiments: list[str], condition: str) -> list[Run]:
-    order = ["attributes.start_time ASC"]
-    page = client.search_runs(experiments, condition, order_by=order)
-    found: list[Run] = list(page)
-    while page.token:
-        page = client.search_runs(experiments, condition, order_by=order, page_token=page.token)
-        found.extend(page)
+    found = search(client, experiments, condition, ["attributes.start_time ASC"])
     return list({run.data.tags["key"]: run for run in found}.values())
 
 
 def _fetch(client: MlflowClient, run: Run, folder: Path) -> Cell:
     """Download one run; one that failed before it had a record keeps its status."""
-    key, name = run.data.tags["key"], run.info.run_name or run.data.tags["key"]
-    files = [item.path for item in client.list_artifacts(run.info.run_id) if not item.is_dir]
+    key = key_of(run.data.tags["key"])
+    name = run.info.run_name or key
+    files = [file_name(item.path) for item in client.list_artifacts(run.info.run_id) if not item.is_dir]
     if RECORD not in files:
         return Cell(key, name, status=run.info.status.lower())
     target = make_folder(Results(folder).folder(key))
