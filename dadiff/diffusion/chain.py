@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -12,7 +12,7 @@ from tqdm import tqdm
 from dadiff.diffusion.context import Context, Counted, Denoise, Project, unprojected
 from dadiff.diffusion.enforcement import Enforcement, Never
 from dadiff.diffusion.estimate import Estimate
-from dadiff.diffusion.samplers import Sampler
+from dadiff.diffusion.samplers import Sampler, Step
 from dadiff.diffusion.schedule import Schedule
 from dadiff.diffusion.silence import begin
 
@@ -36,6 +36,25 @@ class Samples:
     diverged_at: int | None = None
 
 
+@dataclass(frozen=True)
+class Start:
+    """A guess of the plans, such as the last ones moved on; the chain begins where it is noised to a given signal.
+
+    Args:
+        tau: the guess, of the plans' shape, in the sampler's coordinates.
+        signal: alpha_bar of the first step that is taken, at least.
+    """
+
+    tau: Tensor
+    signal: float = 0.5
+
+    def noised(self, steps: list[Step], schedule: Schedule, noise: Callable[[], Tensor]) -> tuple[Tensor, list[Step]]:
+        """tau_i = sqrt(alpha_bar_i) tau + sqrt(1 - alpha_bar_i) eps, and the steps from i on; at least the last one."""
+        left = [step for step in steps if schedule.alpha_bar[step.i] >= self.signal] or steps[-1:]
+        alpha_bar = float(schedule.alpha_bar[left[0].i])
+        return alpha_bar**0.5 * self.tau + (1 - alpha_bar) ** 0.5 * noise(), left
+
+
 @torch.inference_mode()
 def sample(
     sampler: Sampler,
@@ -50,6 +69,7 @@ def sample(
     divergence_bound: float = 1e6,
     progress: bool = False,
     estimate: Estimate | None = None,
+    start: Start | None = None,
 ) -> Samples:
     """Algorithm 1 (and 2, which differ in P): predict, then project, from i = L to 1.
 
@@ -64,6 +84,7 @@ def sample(
         divergence_bound: the chain stops once max |tau| exceeds it.
         progress: show a progress bar.
         estimate: how uncertain the clean estimate is, for enforcements that weigh by it.
+        start: what to begin from instead of noise.
 
     Returns:
         float64 plans; the chain as it stood if it diverged.
@@ -75,10 +96,14 @@ def sample(
     by = enforcement if enforcement and project else Never()
     ask, memory = Counted(denoise), dict[str, Any]()
     planned = [by.weights(step, schedule) for step in sampler.steps(schedule)]
-    tau, steps = begin(planned, schedule, noise, project or unprojected, by)  # line 1: tau_L ~ N(0, I)
+    steps: Sequence[Step]
+    if start:
+        tau, steps = start.noised(planned, schedule, noise)
+    else:  # line 1: tau_L ~ N(0, I)
+        tau, steps = begin(planned, schedule, noise, project or unprojected, by)
     if observe and steps[0].i < schedule.num_steps:
         observe(steps[0].i, "project", tau)
-    tau0_hat = torch.zeros_like(tau)
+    tau0_hat = start.tau if start else torch.zeros_like(tau)
     bar = tqdm(steps, desc="sampling", unit="step", disable=None if progress else True, leave=False)
     for step in bar:  # line 2: for i = L, ..., 1
         at = Context(step, schedule, tau, environment, project or unprojected, ask, noise, estimate, memory)

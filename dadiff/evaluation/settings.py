@@ -1,10 +1,16 @@
-"""How plans are drawn for evaluation."""
+"""How plans are drawn for evaluation, and which episodes are run."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
 
 from dadiff.errors import ConfigError
+
+ControllerChoice = Literal["receding", "tracking", "optimal"]
 
 
 @dataclass(frozen=True)
@@ -28,4 +34,42 @@ class Evaluation:
             raise ConfigError(
                 f"evaluation: samples is {self.samples}, examples {self.examples}, divergence_bound "
                 f"{self.divergence_bound}; need at least 1, at least 0 and a positive number"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClosedLoop(Evaluation):
+    """Plans as in `Evaluation`, and episodes.
+
+    Args:
+        replan_every: intervals between two plans, in steps.
+        steps: length of an episode; None is the horizon.
+        disturbance: standard deviation of the disturbance per state and step; None is the system's process noise.
+        controllers: `receding` follows its plan open loop between two plans, `tracking` with LQR gains about the
+            plan; `optimal` is the expert planning at the same interval.
+        warm_start: begin the chain from the last plan, moved on, instead of noise.
+        delay: steps by which inputs come late.
+        rate: plans a second that the robot asks for; slower ones miss their deadline.
+    """
+
+    replan_every: Sequence[int] = (1, 10, 30)
+    steps: int | None = None
+    disturbance: float | None = None
+    controllers: Sequence[ControllerChoice] = ("receding", "tracking", "optimal")
+    warm_start: bool = True
+    delay: int = 0
+    rate: float = 100.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.replan_every or min(self.replan_every) < 1:
+            raise ConfigError(
+                f"evaluation: replan_every is {list(self.replan_every)}; name intervals of 1 or more steps"
+            )
+        if (self.steps is not None and self.steps < 1) or self.delay < 0:
+            raise ConfigError(f"evaluation: steps is {self.steps} and delay {self.delay}; need at least 1, at least 0")
+        if not self.rate > 0 or (self.disturbance is not None and not 0 <= self.disturbance < np.inf):
+            raise ConfigError(
+                f"evaluation: rate is {self.rate}, disturbance {self.disturbance}; need a positive number of plans a "
+                "second and a standard deviation of at least 0"
             )

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from dadiff.behaviours import Pin, Projection, TrajectorySet
-from dadiff.diffusion.chain import Observe, Samples, sample
+from dadiff.diffusion.chain import Observe, Samples, Start, sample
 from dadiff.diffusion.context import Project
 from dadiff.diffusion.enforcement import Enforcement
 from dadiff.diffusion.estimate import Estimate
@@ -102,7 +102,7 @@ class Planner:
             environment: E (*robots, *cases, c); or give the fields of E by name, such as x_init=[...], target=[...].
             samples: plans for each E.
             seed: of all noise; the same seed gives the same plans.
-            start: plans to begin from, of the shape of the result, instead of noise; see `sample`.
+            start: plans to begin from instead of noise, of the shape of the result; see `Start`.
             pins: further entries of tau that are held, with values (*robots, *cases * samples, k).
 
         Raises:
@@ -179,7 +179,11 @@ class Planner:
             self.divergence_bound,
             progress,
             estimate=self.estimate,
+            start=None if start is None else Start(self._scaled(start)),
         )
+
+    def _scaled(self, tau: np.ndarray) -> torch.Tensor:
+        return torch.as_tensor(self.coordinates.to_scaled(tau), device=self.device)
 
     def of(self, system: System, projector: Projector) -> Planner:
         """The same network for another robot: what it draws becomes a plan of this system through its own set."""

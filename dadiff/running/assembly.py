@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,7 +19,7 @@ from dadiff.experts.lqr import GaussianLaw
 from dadiff.running.identity import Artefact, Identity, Shared, identity_of
 from dadiff.running.parts import Parts
 from dadiff.store import Cache, Results
-from dadiff.systems import System
+from dadiff.systems import Recording, Robots, System
 from dadiff.tasks import Cases, Demonstrations
 from dadiff.tasks.encodings import Encoder
 from dadiff.tasks.task import Augmenting, Lawful
@@ -191,6 +191,16 @@ class Experiment:
             return Estimate.of_covariance(self.layout, where, shown.trajectories, covariance)
         return Estimate.of_demonstrations(self.layout, where, shown.trajectories, shown.environment)
 
+    @cached_property
+    def single(self) -> Planner:
+        """The planner of one robot: of a fleet, of its first."""
+        if not isinstance(self.target, Robots):
+            return self.planner
+        first = self.target.take([0])
+        sources = {name: _of_first(source) for name, source in self.sources.items()}
+        behaviour = self.parts.projector.fit(self.layout, system=first, **sources)
+        return replace(self.planner, system=first, behaviour=behaviour)
+
     @property
     def is_done(self) -> bool:
         """Whether there is a result that is only to be read."""
@@ -245,3 +255,8 @@ class Experiment:
             augment=task.augment if isinstance(task, Augmenting) and not self.encoder else None,
             progress=self.parts.settings.progress,
         )
+
+
+def _of_first(source: Any) -> Any:
+    """A recording of the first robot; demonstrations are not a robot's."""
+    return Recording(source.states[:1], source.inputs[:1]) if isinstance(source, Recording) else source

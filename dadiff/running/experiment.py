@@ -16,7 +16,8 @@ import yaml
 
 from dadiff.behaviours import Known, compared, pins, prediction_error
 from dadiff.diffusion.chain import Samples
-from dadiff.evaluation import replay, tracking_errors
+from dadiff.evaluation import ClosedLoop, replay, tracking_errors
+from dadiff.evaluation.closed_loop import Bench, latencies, means
 from dadiff.evaluation.mahalanobis import MahalanobisDistance
 from dadiff.evaluation.records import ChainRecorder, Snapshots, headline, merged, tables
 from dadiff.outside import passwords_removed
@@ -136,7 +137,11 @@ def _store(experiment: Experiment, plans: Plans, started: float) -> StoredRun:
     if diverged_at is None:
         scores = evaluate(experiment, plans.planned)
         written |= tables(scores)
-        metrics = headline(scores) | metrics
+        metrics = headline(scores) | metrics | latency(experiment)
+        if isinstance(experiment.parts.evaluation, ClosedLoop):
+            episodes = Bench(experiment.planner, experiment.cases, experiment.parts.evaluation).table()
+            written["closed_loop"] = episodes
+            metrics |= means(episodes)
         arrays = examples(experiment, plans)
     record = record_of(
         experiment.identity,
@@ -164,6 +169,16 @@ def evaluate(experiment: Experiment, planned: np.ndarray) -> Scores:
         tracking_errors(system, layout, cases, planned, rollout),
         experiment.parts.task.score(system, cases, planned, rollout),
     )
+
+
+def latency(experiment: Experiment) -> dict[str, float]:
+    """Seconds that one plan for one robot takes, and the share of plans later than the robot asks for."""
+    first = experiment.cases.environment[..., :1, :]
+    seconds = latencies(experiment.single, first[:1])  # of a fleet its first robot; of one system, all there is
+    measures = {"plan_latency": float(np.median(seconds)), "plan_latency_p99": float(np.quantile(seconds, 0.99))}
+    if isinstance(experiment.parts.evaluation, ClosedLoop):
+        measures["deadlines_missed"] = float((seconds > 1 / experiment.parts.evaluation.rate).mean())
+    return measures
 
 
 def examples(experiment: Experiment, plans: Plans) -> dict[str, np.ndarray]:

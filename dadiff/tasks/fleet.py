@@ -99,3 +99,16 @@ class Fleet(ManyRobots):
     def score(self, system: LinearRobots, cases: Cases, planned: np.ndarray, rollout: np.ndarray) -> Scores:
         """The cost after replay, relative to each robot's own optimum; see `scores_of`."""
         return scores_of(system, self.lqr.score(system, cases, planned, rollout).per_plan["cost_ratio"])
+
+    def solve(self, system: LinearRobots, environment: np.ndarray) -> np.ndarray:
+        """Each robot's optimum tau (robots, ..., d) without process noise for E (robots, ..., c)."""
+        ends = {name: self.condition(system).get(environment, name) for name in ("x_init", "target")}
+        return self.lqr.solve(system, ends_layout(system).pack(**ends))
+
+    def goal(self, system: LinearRobots, environment: np.ndarray) -> np.ndarray:
+        """The target (robots, ..., n)."""
+        return self.condition(system).get(environment, "target")
+
+    def weights(self, system: LinearRobots) -> tuple[np.ndarray, np.ndarray]:
+        """Q and R, the same for all robots."""
+        return self.lqr.weights(system)

@@ -164,6 +164,20 @@ class LQR:
         noise = rng.standard_normal((*environment.shape[:-1], law.noise_map.shape[-1]))
         return law.mean(environment) + along(law.noise_map, noise)
 
+    def solve(self, system: AffineSystem, environment: np.ndarray) -> np.ndarray:
+        """The optimum tau (*robots, ..., d) without process noise for [x_init; target] (*robots, ..., 2n)."""
+        cost, ends = self.cost(system), self.condition(system).unpack(environment)
+        feedback = optimal_feedback(system, cost.Q, cost.R, self.horizon, cost.terminal)
+        return follow(system, feedback, ends["x_init"], ends["target"])
+
+    def goal(self, system: AffineSystem, environment: np.ndarray) -> np.ndarray:
+        """The target (*robots, ..., n)."""
+        return self.condition(system).get(environment, "target")
+
+    def weights(self, system: AffineSystem) -> tuple[np.ndarray, np.ndarray]:
+        """Q and R."""
+        return self.cost(system).Q, self.cost(system).R
+
     def score(self, system: AffineSystem, cases: Cases, planned: np.ndarray, rollout: np.ndarray) -> Scores:
         """The cost after replay over that of the noise-free finite-horizon optimum; and how widely plans are spread.
 
@@ -171,8 +185,7 @@ class LQR:
         right samples: each plan's squared distance from their mean, S / (S - 1) times, over the trace.
         """
         cost, target, layout = self.cost(system), cases.get("target"), system.layout(self.horizon)
-        feedback = optimal_feedback(system, cost.Q, cost.R, self.horizon, cost.terminal)
-        optimum = follow(system, feedback, cases.x_init, target)
+        optimum = self.solve(system, ends_layout(system).pack(x_init=cases.x_init, target=target))
         ratio = cost(*layout.split(rollout), target[..., None, :]) / cost(*layout.split(optimum), target)[..., None]
         return Scores(per_plan={"cost_ratio": ratio, **self._spread(system, planned)})
 

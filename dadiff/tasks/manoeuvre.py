@@ -109,6 +109,20 @@ class Manoeuvre(ManyRobots):
         optimal = self.cost(system, cases.reference, target)
         return scores_of(system, self.cost(system, rollout, target[..., None, :]) / optimal[..., None])
 
+    def solve(self, system: Robots, environment: np.ndarray) -> np.ndarray:
+        """Each robot's optimum tau (robots, ..., d) for E (robots, ..., c)."""
+        ends = {name: self.condition(system).get(environment, name) for name in ("x_init", "target")}
+        return self.optimum(system, self._ends(system).pack(**ends)).tau
+
+    def goal(self, system: Robots, environment: np.ndarray) -> np.ndarray:
+        """At rest at the target, (robots, ..., n)."""
+        target = self.condition(system).get(environment, "target")
+        return system.layout(self.horizon).states(self._at_rest(system, target))[..., 0, :]
+
+    def weights(self, system: Robots) -> tuple[np.ndarray, np.ndarray]:
+        """Q and R of a step before the last."""
+        return np.diag(np.asarray(self.state_cost, dtype=np.float64)), self.input_cost * np.eye(system.input_dim)
+
     def cost(self, system: Robots, tau: np.ndarray, target: np.ndarray) -> np.ndarray:
         """The cost (...) of trajectories (..., d) towards targets (..., p), see the module."""
         return self.metric(system).squared(tau - self._at_rest(system, target))

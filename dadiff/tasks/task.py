@@ -165,6 +165,23 @@ class Continuing(Protocol):
 
 
 @runtime_checkable
+class Steering(Protocol):
+    """A task that steers to a goal at quadratic cost, from whatever state: it can be planned for again and again."""
+
+    def solve(self, system: System, environment: np.ndarray) -> np.ndarray:
+        """The expert's tau (*robots, ..., d) without process noise for E (*robots, ..., c)."""
+        ...
+
+    def goal(self, system: System, environment: np.ndarray) -> np.ndarray:
+        """The state (*robots, ..., n) that E (*robots, ..., c) asks for."""
+        ...
+
+    def weights(self, system: System) -> tuple[np.ndarray, np.ndarray]:
+        """Q (n, n) and R (m, m) of each step's |x(t) - goal|_Q^2 + |u(t)|_R^2."""
+        ...
+
+
+@runtime_checkable
 class Augmenting(Protocol):
     """A task that knows changes of E which leave the optimum as it is."""
 

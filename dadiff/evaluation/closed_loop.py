@@ -1,0 +1,177 @@
+"""Closed loop: episodes in which plans are made anew from where the robot is, under disturbances.
+
+Every controller meets the same disturbances and is held against the expert that plans anew at each step (`optimal`, 1).
+What separates methods is how seldom they may plan: the interval between plans is the axis.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from dadiff.control import Controller, Episode, OpenLoop, RecedingHorizon, Tracking, run
+from dadiff.control.controllers import Trajectories, tracking_gains
+from dadiff.errors import ConfigError
+from dadiff.evaluation.settings import ClosedLoop, ControllerChoice
+from dadiff.planning import Planner, Plans
+from dadiff.randomness import numpy_generator
+from dadiff.tasks.task import Cases, Steering
+
+TIMED_PLANS, TIMED_SECONDS = 100, 5.0  # plans of one case, one at a time, for the latency
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Episodes of one planner's system and cases, for any controller.
+
+    Args:
+        planner: what is tested; its system is the robot.
+        cases: start, goal, and what else E holds.
+        evaluation: how.
+    """
+
+    planner: Planner
+    cases: Cases
+    evaluation: ClosedLoop
+
+    @property
+    def task(self) -> Steering:
+        """Raises `ConfigError` unless it steers to a goal."""
+        if not isinstance(self.planner.task, Steering):
+            raise ConfigError(
+                "evaluation: closed_loop needs a task that steers to a goal at quadratic cost; use task=lqr or "
+                "task=fleet, or evaluation=default"
+            )
+        return self.planner.task
+
+    @property
+    def steps(self) -> int:
+        """K."""
+        return self.evaluation.steps or self.planner.layout.horizon
+
+    def table(self) -> pd.DataFrame:
+        """A row for each controller, interval, robot and case.
+
+        cost_ratio is against the expert that plans at each step, cost_ratio_same against it at the same interval;
+        distance is |x(K) - goal|, largest_input max |u|. An episode that left float range has cost_ratio inf.
+        """
+        best = self._cost(self.episode("optimal", 1))
+        rows = []
+        for every in self.evaluation.replan_every:
+            same = self._cost(self.episode("optimal", every))
+            for kind in self.evaluation.controllers:
+                rows.append(self._rows(kind, every, self.episode(kind, every), best, same))
+        return pd.concat(rows, ignore_index=True)
+
+    def _rows(
+        self, kind: ControllerChoice, every: int, episode: Episode, best: np.ndarray, same: np.ndarray
+    ) -> pd.DataFrame:
+        cost = self._cost(episode)
+        away = episode.states[..., -1, :] - self.task.goal(self.planner.system, self.cases.environment)
+        values = {
+            "cost_ratio": cost / best,
+            "cost_ratio_same": cost / same,
+            "distance": np.linalg.norm(away, axis=-1),
+            "largest_input": np.abs(episode.inputs).max(axis=(-2, -1)),
+        }
+        index = np.indices(cost.shape, dtype=np.int32).reshape(cost.ndim, -1)
+        names = ("robot", "case")[-cost.ndim :]
+        return pd.DataFrame(
+            {"controller": kind, "every": every, **dict(zip(names, index, strict=True))}
+            | {name: np.where(np.isfinite(v), v, np.inf).ravel() for name, v in values.items()}
+        )
+
+    def episode(self, kind: ControllerChoice, every: int) -> Episode:
+        """One controller on all cases."""
+        x_init, planner = self.cases.x_init, self.planner
+        return run(planner.system, self.controller(kind, every), x_init, self.steps, self._disturbance(),
+                   delay=self.evaluation.delay)  # fmt: skip
+
+    def controller(self, kind: ControllerChoice, every: int) -> Controller:
+        """See `ClosedLoop.controllers`."""
+        if kind == "optimal":
+            return RecedingHorizon(self._optimal_plan, every)
+        follow = self._tracked if kind == "tracking" else (lambda states, inputs: OpenLoop(inputs))
+        return RecedingHorizon(self._planned(), every, follow)
+
+    def _optimal_plan(self, x: np.ndarray, start: Trajectories | None) -> Trajectories:
+        layout, system = self.planner.layout, self.planner.system
+        return layout.split(self.task.solve(system, self._from(x)))
+
+    def _planned(self) -> PlanAnew:
+        return PlanAnew(self.planner, self._from, self.evaluation.seed, warm=self.evaluation.warm_start)
+
+    def _tracked(self, states: np.ndarray, inputs: np.ndarray) -> Controller:
+        gains = tracking_gains(self.planner.system, states, inputs, *self.task.weights(self.planner.system))
+        return Tracking(states, inputs, gains)
+
+    def _from(self, x: np.ndarray) -> np.ndarray:
+        """E with the present state as its start."""
+        return moved(self.planner, self.cases.environment, x)
+
+    def _disturbance(self) -> np.ndarray:
+        """w (*robots, cases, K, n), the same for every controller."""
+        rng = numpy_generator(self.evaluation.seed, "disturbance")
+        system, std = self.planner.system, self.evaluation.disturbance
+        unit = rng.standard_normal((*self.cases.x_init.shape[:-1], self.steps, system.state_dim))
+        return unit * (system.process_noise if std is None else std)
+
+    def _cost(self, episode: Episode) -> np.ndarray:
+        """sum_t |x(t) - goal|_Q^2 + |u(t)|_R^2, (*robots, cases)."""
+        Q, R = self.task.weights(self.planner.system)
+        goal = self.task.goal(self.planner.system, self.cases.environment)
+        away, u = episode.states[..., :-1, :] - goal[..., None, :], episode.inputs
+        with np.errstate(over="ignore", invalid="ignore"):
+            return ((away @ Q) * away).sum(axis=(-2, -1)) + ((u @ R) * u).sum(axis=(-2, -1))
+
+
+@dataclass
+class PlanAnew:
+    """Asks a planner for one plan from each present state; fresh noise each time, the same for all methods."""
+
+    planner: Planner
+    environment_from: Callable[[np.ndarray], np.ndarray]
+    seed: int
+    warm: bool
+    asked: int = 0
+
+    def __call__(self, x: np.ndarray, start: Trajectories | None) -> Trajectories:
+        """States and inputs of the new plans."""
+        layout = self.planner.layout
+        begin = Plans(layout, layout.flatten(*start)[..., None, :], 0) if start is not None and self.warm else None
+        plans = self.planner.plan(self.environment_from(x), seed=self.seed + self.asked, start=begin)
+        self.asked += 1
+        return plans.states[..., 0, :, :], plans.inputs[..., 0, :, :]
+
+
+def moved(planner: Planner, environment: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """E (..., c) with x_init replaced by x (..., n)."""
+    E = environment.copy()
+    E[..., planner.condition.where("x_init")] = x
+    return E
+
+
+def latencies(planner: Planner, environment: np.ndarray, count: int = TIMED_PLANS) -> np.ndarray:
+    """Seconds that each of several plans for one E (*robots, c) took, one after the other; the first is not counted.
+
+    At most TIMED_SECONDS in all, and at least three plans.
+    """
+    seconds: list[float] = []
+    planner.plan(environment)
+    begun = time.perf_counter()
+    while len(seconds) < count and (len(seconds) < 3 or time.perf_counter() - begun < TIMED_SECONDS):
+        start = time.perf_counter()
+        planner.plan(environment, seed=len(seconds))
+        seconds.append(time.perf_counter() - start)
+    return np.array(seconds)
+
+
+def means(table: pd.DataFrame) -> dict[str, float]:
+    """`closed_loop_<controller>_<every>`: the mean cost ratio over robots and cases."""
+    groups = table.groupby(["controller", "every"], as_index=False)["cost_ratio"].mean()
+    rows = zip(groups["controller"], groups["every"], groups["cost_ratio"], strict=True)
+    return {f"closed_loop_{controller}_{every}": float(mean) for controller, every, mean in rows}
