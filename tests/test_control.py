@@ -16,6 +16,7 @@ SYSTEM, TASK = double_integrator(), LQR()
 LAYOUT = SYSTEM.layout(TASK.horizon)
 CASES = TASK.cases(SYSTEM, 6, numpy_generator(0, "cases"))
 STATES, INPUTS = LAYOUT.split(CASES.reference)
+Q, R = TASK.weights(SYSTEM)
 
 
 def disturbance(steps: int, size: float = 0.05) -> np.ndarray:
