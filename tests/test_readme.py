@@ -1,6 +1,5 @@
 """Every command and every example of the README runs."""
 
-import json
 import os
 import re
 import subprocess
@@ -8,6 +7,10 @@ import sys
 from pathlib import Path
 
 import pytest
+
+from dadiff.reporting import published
+from dadiff.reporting.claims import read_ledger
+from dadiff.reporting.definitions import FOLDER
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
@@ -59,27 +62,20 @@ def test_the_projector_of_the_readme_is_one_class_and_one_yaml(tmp_path):
     assert "components=[mylab]" in refused.stderr
 
 
-def published(name: str) -> dict:
-    return json.loads((ROOT / "reports" / "published" / name / "report.json").read_text())
-
-
 def test_the_table_of_verdicts_is_that_of_the_published_reports():
-    rows = re.findall(r"^\| (.*?) \| (.*?) \| \[`?(\w+)`?\]\(reports/published/(\w+)\) \|$", README, flags=re.MULTILINE)
-    assert len(rows) > 15
-    for claim, verdict, shown, name in rows:
-        assert shown == name
-        found = {entry["claim"]["claim"]: entry["verdict"] for entry in published(name)["claims"]}
-        assert found[claim] == verdict
+    pattern = r"^\| (.*?) \| (.*?) \| (.*?) \| \[`?(\w+)`?\]\(reports/published/(\w+)\) \|$"
+    rows = re.findall(pattern, README, flags=re.MULTILINE)
+    said = published.verdicts(ROOT / "reports" / "published", read_ledger(FOLDER / "claims.yaml"))
+    assert rows == [(line.claim.claim, line.verdict, line.effect_words, name, name) for name, line in said]
 
 
 def test_what_is_published_is_whole_small_and_knows_no_place():
     folder = ROOT / "reports" / "published"
     files = [path for path in folder.rglob("*") if path.is_file()]
     assert sum(path.stat().st_size for path in files) < 8e6
-    for name in (path.name for path in folder.iterdir()):
-        assert {"report.json", "configurations.yaml", "figures", "tables"} <= {
-            p.name for p in (folder / name).iterdir()
-        }
+    for name in (path.name for path in folder.iterdir() if path.is_dir()):
+        parts = {path.name for path in (folder / name).iterdir()}
+        assert {"README.md", "report.json", "configurations.yaml", "figures", "tables"} <= parts
         assert f"`{name}`" in README
     for path in files:
         assert not re.search(r"(?<![\w.])/(tmp|home|root|work)/", path.read_text())

@@ -101,7 +101,7 @@ def test_what_is_published_is_numbers_configurations_and_drawings(tmp_path):
     assert cli.main(command) == 0
     files = {path.relative_to(published).as_posix() for path in published.rglob("*") if path.is_file()}
     assert {"report.json", "configurations.yaml", "tables/summary.csv", "figures/errors.svg"} <= files
-    assert {Path(file).suffix for file in files} == {".json", ".yaml", ".csv", ".svg"}
+    assert {Path(file).suffix for file in files} == {".json", ".yaml", ".csv", ".svg", ".md"}
     assert not (out / "figures" / "older.svg").exists()
     assert not (published / "figures" / "older.svg").exists()
     assert (out / "figures" / "mine.svg").exists()

@@ -26,10 +26,6 @@ ALIASES = ("projector.initial_state",)  # stored as `initial_state`, too
 FIRST = ("task", "projector", "enforcement", "initial_state", "recording.length", "system.process_noise", "denoiser")
 LEVELS = ("robot", "case", "sample", "t")
 
-
-FLOORS = {"cost_ratio": 1.0, "median_cost_ratio": 1.0}
-"""What metrics cannot go below, where it is not 0: a cost over the optimal cost."""
-
 DRAWN = {"seed": "seed", "training.seed": "training seed", "recording.seed": "recording", "dataset.seed": "data set",
          "evaluation.seed": "noise of sampling", "task.seed": "draw of the robots"}  # fmt: skip
 """What a seed draws anew."""

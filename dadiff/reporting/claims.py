@@ -206,7 +206,7 @@ def sentence(findings: list[Finding]) -> str:
         return "not tested here"
     if count in (len(so), len(no), len(undecided)):
         verb = "holds" if so else "does not hold" if no else "undecided"
-        return verb if count == 1 else f"{verb} for {count} of {count}" if so else f"{verb} for any of {count}"
+        return verb if count == 1 else f"{verb} for any of {count}" if no else f"{verb} for {count} of {count}"
     parts = [f"holds for {len(so)} of {count}"] if so else [f"does not hold for {len(no)} of {count}"]
     if so and no:
         where = shared(so, [*no, *undecided])

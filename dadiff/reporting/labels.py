@@ -67,12 +67,36 @@ METRICS = {
     "clearance_rollout": "clearance after replay [m]",
     "side_agreement_rollout": "same side as the expert, after replay",
 }
+ROUNDING = 1e-18
+"""Below this a squared error is that of the arithmetic."""
+
+FLOORS = {"cost_ratio": 1.0, "median_cost_ratio": 1.0}
+"""What metrics cannot go below, where it is not 0: a cost over the optimal cost."""
+
 SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def metric_name(metric: str) -> str:
     """A metric in words."""
     return METRICS.get(metric, metric.replace("_", " "))
+
+
+def column_name(metric: str) -> str:
+    """A metric as the head of a column, where what lies above its floor is shown."""
+    return f"{metric_name(metric)} − 1" if metric in FLOORS else metric_name(metric)
+
+
+def column_value(metric: str, value: float, low: float, high: float) -> str:
+    """A metric and its interval in a column: above its floor, and `exact` where it is rounding.
+
+    Example:
+        >>> column_value("cost_ratio", 1.25, 1.125, 1.5), column_value("gap", 1e-30, 0, 1e-29)
+        ('0.250 [0.125, 0.500]', 'exact')
+    """
+    floor = FLOORS.get(metric, 0.0)
+    if metric.endswith(("_error", "gap", "_residual")) and value < ROUNDING:
+        return "exact"
+    return with_interval(value - floor, low - floor, high - floor)
 
 
 def axis_name(axis: str) -> str:

@@ -14,8 +14,8 @@ import numpy as np
 import pandas as pd
 from scipy.special import ndtri
 
-from dadiff.reporting.aggregation import FLOORS, Evidence, Method, Runs, has_metric, pair, pairs
-from dadiff.reporting.labels import axis_value, method_name, metric_name, with_interval
+from dadiff.reporting.aggregation import Evidence, Method, Runs, has_metric, pair, pairs
+from dadiff.reporting.labels import FLOORS, axis_value, method_name, metric_name, with_interval
 from dadiff.reporting.selection import Selector
 from dadiff.reporting.statistics import Band, Draws, Estimate, mean, ratio, ratio_band
 

@@ -19,7 +19,8 @@ import numpy as np
 from markupsafe import Markup, escape
 
 from dadiff.errors import StoreError
-from dadiff.reporting import configurations, labels
+from dadiff.reporting import configurations, labels, published
+from dadiff.reporting.claims import read_ledger
 from dadiff.reporting.definitions import FOLDER
 from dadiff.reporting.figures.style import INK
 from dadiff.reporting.figures.style import render as render_figure
@@ -29,7 +30,6 @@ from dadiff.reporting.statistics import Estimate
 from dadiff.reporting.tables import to_csv
 from dadiff.store.files import make_folder, strict
 
-FORMAT = 1
 DIGITS = 6
 """Of numbers in report.json: the last ones differ between processors."""
 
@@ -53,7 +53,8 @@ def render(report: Report, folder: Path) -> Path:
         _write_tables(report, folder / "tables")
         for name, drawing in drawings.items():
             for form, content in drawing.files.items():
-                (folder / "figures" / f"{name}.{form}").write_bytes(content)
+                shown = with_panel(content) if form == "svg" else content
+                (folder / "figures" / f"{name}.{form}").write_bytes(shown)
         (folder / "report.json").write_text(to_json(numbers(report)), "utf-8")
         (folder / "configurations.yaml").write_text(configurations.to_yaml(report.evidence.sweep), "utf-8")
         (folder / "index.html").write_text(to_html(report, drawings), "utf-8")
@@ -66,6 +67,8 @@ def render(report: Report, folder: Path) -> Path:
 def publish(report: Path, folder: Path) -> None:
     """Copy of a report's folder what is worth keeping under version control: numbers, configurations, figures as SVG.
 
+    Its page is written beside them; in a folder named `published` the index of all reports, too.
+
     Raises:
         StoreError: if the folder cannot be written to.
     """
@@ -76,6 +79,10 @@ def publish(report: Path, folder: Path) -> None:
             make_folder(target.parent)
             shutil.copyfile(path, target)
     _remove(folder, older - _parts_in(folder))
+    if folder.absolute().parent.name == "published":
+        published.write_pages(folder.absolute().parent)
+    else:
+        (folder / "README.md").write_text(published.page(folder, read_ledger(FOLDER / "claims.yaml")), "utf-8")
 
 
 def _parts_in(folder: Path) -> set[str]:
@@ -112,6 +119,15 @@ def _draw(part: Part) -> Drawing:
     return Drawing(files, both.format(wide, Markup(inline_svg(phone, title, f"{name}-phone"))))
 
 
+def with_panel(svg: bytes) -> bytes:
+    """An SVG on a white panel of its own, since nobody knows the page that shows it; once is enough."""
+    end = svg.index(b">", svg.index(b"<svg")) + 1
+    return svg if PANEL in svg else svg[:end] + PANEL + svg[end:]
+
+
+PANEL = b'<rect width="100%" height="100%" rx="6" fill="#ffffff"/>'
+
+
 def _write_tables(report: Report, folder: Path) -> None:
     for part in report.tables:
         if not part.empty:
@@ -125,7 +141,7 @@ def numbers(report: Report) -> dict[str, Any]:
     sweep = report.evidence.sweep
     cells = [{"key": c.key, "name": c.name, "status": c.status, "outcome": c.outcome} for c in sweep.cells]
     content = {
-        "format": FORMAT,
+        "format": published.FORMAT,
         "sweep": sweep.name,
         "definition": report.definition.name,
         "commands": [sweep.command, report.command],

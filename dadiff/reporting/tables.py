@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from dadiff.outside import spreadsheet_safe
-from dadiff.reporting.aggregation import FLOORS, Evidence, Method, has_metric, pair, varying
-from dadiff.reporting.labels import method_name
+from dadiff.reporting.aggregation import Evidence, Method, has_metric, pair, varying
+from dadiff.reporting.labels import FLOORS, method_name
 from dadiff.reporting.selection import Selector
 from dadiff.reporting.statistics import Estimate, difference, mean, ratio
 

@@ -11,9 +11,9 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from dadiff.reporting.aggregation import FLOORS, Evidence, Method, has_metric, pair, varying
+from dadiff.reporting.aggregation import Evidence, Method, has_metric, pair, varying
 from dadiff.reporting.figures.style import legend_below, letter, log_axis, look_of, looks_of, panels
-from dadiff.reporting.labels import axis_name, axis_value, method_name, metric_name
+from dadiff.reporting.labels import FLOORS, axis_name, axis_value, method_name, metric_name
 from dadiff.reporting.selection import Selector
 from dadiff.reporting.statistics import Estimate, mean, ratio
 

@@ -13,9 +13,9 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from dadiff.reporting.aggregation import FLOORS, Evidence, Method
+from dadiff.reporting.aggregation import Evidence, Method
 from dadiff.reporting.figures.style import panels
-from dadiff.reporting.labels import axis_value, metric_name, number
+from dadiff.reporting.labels import FLOORS, axis_value, metric_name, number
 from dadiff.reporting.selection import Selector
 from dadiff.reporting.statistics import Estimate, mean
 

@@ -12,9 +12,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from dadiff.reporting.aggregation import FLOORS, Evidence, Method, varying
+from dadiff.reporting.aggregation import Evidence, Method, varying
 from dadiff.reporting.figures.style import INK, letter, log_axis, look_of, panels
-from dadiff.reporting.labels import method_name, metric_name
+from dadiff.reporting.labels import FLOORS, method_name, metric_name
 from dadiff.reporting.selection import Selector
 from dadiff.reporting.statistics import Estimate, mean
 

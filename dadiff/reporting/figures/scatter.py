@@ -7,9 +7,9 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from dadiff.reporting.aggregation import FLOORS, Evidence, Method, has_metric, varying
+from dadiff.reporting.aggregation import Evidence, Method, has_metric, varying
 from dadiff.reporting.figures.style import PANEL_WIDTH, legend_below, log_axis, looks_of, panels
-from dadiff.reporting.labels import method_name, metric_name
+from dadiff.reporting.labels import FLOORS, method_name, metric_name
 from dadiff.reporting.selection import Selector
 from dadiff.reporting.statistics import Estimate, mean
 
