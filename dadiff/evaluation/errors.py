@@ -25,7 +25,7 @@ def _to_horizon(values: np.ndarray) -> np.ndarray:
 def replay(system: System, layout: TrajectoryLayout, planned: np.ndarray, x_init: np.ndarray) -> np.ndarray:
     """The trajectories (*robots, cases, samples, d) that the planned inputs give from x_init, without noise."""
     inputs = layout.inputs(planned)
-    return layout.flatten(system.simulate(x_init[..., None, :], inputs), inputs)
+    return layout.flatten(system.replay(x_init[..., None, :], inputs), inputs)
 
 
 def dynamics_residual(system: System, layout: TrajectoryLayout, tau: np.ndarray) -> np.ndarray:
@@ -54,6 +54,7 @@ def tracking_errors(
     x, u = layout.split(planned)
     x_replayed = layout.states(rollout)
     x_ref, u_ref = (part[..., None, :, :] for part in layout.split(cases.reference))
+    singular = system.singular(x_replayed)
     return Scores(
         per_step={
             "planned_state_error": _squared(x - x_ref),
@@ -62,5 +63,8 @@ def tracking_errors(
             "gap": _squared(x - x_replayed),
             "dynamics_residual": _to_horizon(dynamics_residual(system, layout, planned)),
         },
-        per_plan={"initial_state_error": _squared(x[..., 0, :] - cases.x_init[..., None, :])},
+        per_plan={
+            "initial_state_error": _squared(x[..., 0, :] - cases.x_init[..., None, :]),
+            **({} if singular is None else {"singular_steps": singular.astype(float)}),
+        },
     )

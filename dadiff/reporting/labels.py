@@ -45,6 +45,7 @@ METRICS = {
     "rollout_state_error": "state error after replay",
     "gap": "gap of plan and replay, squared",
     "dynamics_residual": "dynamics residual, squared",
+    "singular_steps": "singular steps of the replay",
     "initial_state_error": "error of x(0), squared",
     "median_cost_ratio": "median cost / optimal cost",
     "robots_served": "share of robots served",

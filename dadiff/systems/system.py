@@ -162,6 +162,17 @@ class System(ABC):
                 states[..., t + 1, :] = following if noise is None else following + noise[..., t, :]
         return states
 
+    def replay(self, x_init: np.ndarray, inputs: np.ndarray) -> np.ndarray:
+        """What becomes of planned inputs on the robot itself, which may differ from what it was planned for with.
+
+        Arguments and result are those of `simulate`, which it is unless a subclass knows better.
+        """
+        return self.simulate(x_init, inputs)
+
+    def singular(self, states: np.ndarray) -> np.ndarray | None:
+        """At how many steps of states (..., T+1, n) a change of coordinates breaks down, (...); None without one."""
+        return None
+
     def layout(self, horizon: int) -> TrajectoryLayout:
         """The layout of this system's trajectories over T inputs, with its names and units."""
         return TrajectoryLayout(
