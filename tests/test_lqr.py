@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 from laws import AFFINE, fleet, members
 
+from dadiff.behaviours import Known, pins
 from dadiff.datasets import Generated
 from dadiff.errors import ConfigError, InfeasibleError, NotApplicableError
 from dadiff.evaluation import replay
+from dadiff.evaluation.errors import dynamics_residual
 from dadiff.experts.lqr import closed_loop_law, follow, optimal_feedback, stationary_feedback
 from dadiff.randomness import numpy_generator
 from dadiff.systems import AffineSystem, DampedIntegrators, Linear, double_integrator
@@ -162,6 +164,16 @@ def test_a_plan_of_the_expert_is_its_replay(affine):
     cases = task.cases(affine, 3, numpy_generator(0, "test"))
     layout, plans = affine.layout(task.horizon), cases.reference[:, None]
     np.testing.assert_allclose(replay(affine, layout, plans, cases.x_init), plans, atol=1e-10)
+
+
+@pytest.mark.parametrize("initial_state", ["free", "fixed"])
+def test_known_dynamics_keep_what_the_expert_plans_and_mend_what_is_not(affine, initial_state, rng):
+    task, projector = task_for(affine), Known(initial_state)
+    cases, layout = task.cases(affine, 3, numpy_generator(0, "test")), affine.layout(task.horizon)
+    P = projector.fit(layout, affine).bind(pins=pins(projector, layout, cases.x_init))
+    np.testing.assert_allclose(P(cases.reference), cases.reference, atol=1e-10)
+    mended = P(cases.reference + rng.standard_normal(cases.reference.shape))
+    assert dynamics_residual(affine, layout, mended).max() < 1e-20
 
 
 def test_demonstrations_have_the_laws_mean_and_covariance(affine):

@@ -21,7 +21,7 @@ from scipy.linalg import expm
 
 from dadiff.behaviours import Transitions, least_squares
 from dadiff.config import build
-from dadiff.errors import ConfigError, ExcitationError, ShapeError
+from dadiff.errors import ConfigError, ExcitationError, NotApplicableError, ShapeError
 from dadiff.systems import (
     Bounds,
     GaussianExcitation,
@@ -96,6 +96,11 @@ def test_a_system_that_varies_ends_where_its_matrices_end(rng):
     for ask in (lambda: system.simulate(x_init, inputs), lambda: system.matrices(6)):
         with pytest.raises(ShapeError, match=r"given for steps 0\.\.4, asked for step 5"):
             ask()
+
+
+def test_of_a_system_that_varies_nothing_is_recorded():
+    with pytest.raises(NotApplicableError, match=r"varies in time, .* use projector=known"):
+        GaussianExcitation(length=4).record(varying_system(3, 2, 5, seed=0))
 
 
 ALL = {**AFFINE, "fleet": fleet(), "time-varying fleet": varying_system(3, 2, 12, 3, 4)}

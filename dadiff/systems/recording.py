@@ -8,9 +8,10 @@ from typing import Protocol
 
 import numpy as np
 
-from dadiff.errors import ConfigError, ShapeError
+from dadiff.errors import ConfigError, NotApplicableError, ShapeError
 from dadiff.memory import check_fits
 from dadiff.randomness import numpy_generator
+from dadiff.systems.linear import TimeVarying
 from dadiff.systems.system import System
 
 
@@ -77,7 +78,15 @@ class GaussianExcitation:
                 raise ConfigError(f"recording: {name} is {std}; a standard deviation is finite and not negative")
 
     def record(self, system: System) -> Recording:
-        """Γ of every robot of the system."""
+        """Γ of every robot of the system.
+
+        Raises:
+            NotApplicableError: if the system varies in time: what it did says nothing of what it will do.
+        """
+        if isinstance(system, TimeVarying):
+            raise NotApplicableError(
+                "recording: the system varies in time, what is learned from recordings does not; use projector=known"
+            )
         rng = numpy_generator(self.seed, "recording")
         shape = (*system.robots, self.count, self.length)
         inputs = self.input_std * rng.standard_normal((*shape, system.input_dim))
