@@ -68,7 +68,12 @@ def test_its_first_line_says_what_it_is(group, preset):
 
 def test_no_group_is_empty_and_every_folder_is_a_group():
     folders = {folder.name for folder in CONF.iterdir() if folder.is_dir()}
-    assert folders - {"hydra", "sweeps"} == set(GROUPS) == {group for group, _ in PRESETS}
+    assert folders - {"hydra", "preset", "sweeps"} == set(GROUPS) == {group for group, _ in PRESETS}
+
+
+@pytest.mark.parametrize("name", presets("preset"))
+def test_every_preset_of_several_groups_composes(name):
+    assert composed(f"+preset={name}")["choices"] != composed()["choices"]
 
 
 def test_the_defaults_list_is_a_table_of_contents():

@@ -76,10 +76,10 @@ def test_defaults_written_out_or_left_out_are_the_same():
         ("task.state_cost=a", "task (task/lqr.yaml): state_cost is 'a': input should be a valid number"),
         ("task.state_cost=[a]", "task (task/lqr.yaml): state_cost is ['a']: input should be a valid number"),
         (
-            "sampler.last_step_noise=maybe",
-            "sampler (sampler/ddpm.yaml): last_step_noise is 'maybe': input should be a valid boolean",
+            "tracking.enabled=maybe",
+            "tracking (tracking/sqlite.yaml): enabled is 'maybe': input should be a valid boolean",
         ),
-        ("sampler.skip_below=true", "sampler (sampler/ddpm.yaml): skip_below is True: input should be a valid number"),
+        ("sampler.eta=true", "sampler (sampler/dpm_solver.yaml): eta is True: input should be a valid number"),
         ("training.loss_weight=none", "training (training/quick.yaml): loss_weight is 'none': input should be"),
         ("device=tpu", "config.yaml: device is 'tpu': input should be 'auto', 'cpu' or 'cuda'"),
         ("seed=-0.5", "config.yaml: seed is -0.5: input should be a valid integer"),
@@ -188,12 +188,10 @@ def test_everything_is_checked_before_anything_is_built():
 
 def test_a_key_misspelt_inside_a_preset_is_named_with_its_file(tmp_path):
     shutil.copytree(CONF, tmp_path / "conf", symlinks=False)
-    preset = tmp_path / "conf" / "sampler" / "ddpm.yaml"
-    preset.write_text(preset.read_text().replace("last_step_noise", "last_step_noice"))
+    preset = tmp_path / "conf" / "sampler" / "dpm_solver.yaml"
+    preset.write_text(preset.read_text().replace("num_steps", "num_stebs"))
     config = composed(conf=tmp_path / "conf")
-    with pytest.raises(
-        ConfigError, match=r"^sampler \(sampler/ddpm\.yaml\): key 'last_step_noice' .* last_step_noise\?$"
-    ):
+    with pytest.raises(ConfigError, match=r"^sampler \(sampler/dpm_solver\.yaml\): key 'num_stebs' .* num_steps\?$"):
         assemble(config)
 
 

@@ -10,7 +10,7 @@ import torch
 from laws import fleet, members, trajectories
 
 from dadiff.errors import ConfigError
-from dadiff.evaluation import Evaluation, replay, tracking_errors
+from dadiff.evaluation import Evaluation, replay, spread, tracking_errors
 from dadiff.evaluation.errors import dynamics_residual
 from dadiff.evaluation.records import Snapshots, headline, long_table, merged, tables
 from dadiff.tasks import Cases, Scores
@@ -131,3 +131,15 @@ def test_snapshots_of_a_short_chain_bear_the_steps_that_it_visits():
 def test_values_out_of_range_are_refused_in_one_line(options):
     with pytest.raises(ConfigError, match=r"^evaluation: [^\n]*$"):
         replace(Evaluation(), **options)
+
+
+def test_spread_is_the_trace_of_the_covariance_of_a_cases_plans():
+    rng = np.random.default_rng(0)
+    deviation, cases = np.array([1.0, 2.0, 0.5]), 400
+    planned = rng.standard_normal((cases, 1, 3)) * 100 + rng.standard_normal((cases, 5, 3)) * deviation
+    found = spread(planned, covariance_trace=float((deviation**2).sum())).headline
+    np.testing.assert_allclose(found["spread"], (deviation**2).sum(), rtol=0.1)
+    np.testing.assert_allclose(found["spread_ratio"], 1, rtol=0.1)
+    assert spread(planned).headline == {"spread": found["spread"]}
+    assert spread(planned, covariance_trace=0.0).headline == {"spread": found["spread"]}
+    assert spread(planned[:, :1]).headline == {}

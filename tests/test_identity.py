@@ -49,7 +49,7 @@ EXACT = ("denoiser=gaussian",)
         "schedule.slope=0.0005",
         "denoiser.width=16",
         "training.steps=10",
-        "sampler.last_step_noise=false",
+        "sampler.eta=1.0",
         "projector.initial_state=fixed",
         "enforcement._target_=dadiff.diffusion.enforcement.PostHoc",
         "evaluation.samples=3",
@@ -94,7 +94,7 @@ def test_the_order_of_keys_and_the_names_of_presets_do_not_count():
 
 def test_a_default_left_out_is_a_default_written_out():
     config = copy.deepcopy(usual())
-    del config["projector"]["initial_state"], config["sampler"]["variance"]
+    del config["projector"]["initial_state"], config["sampler"]["spacing"]
     assert identify(config).key == key()
 
 
@@ -115,7 +115,7 @@ def test_a_training_follows_what_it_learns_from():
         "schedule.slope=0.0005",
     ):
         assert identify(changed((override,))).denoiser.key != trained, override
-    for override in ("sampler.skip_below=0.0", "dataset.test_size=99", "evaluation.samples=3"):
+    for override in ("sampler.num_steps=7", "dataset.test_size=99", "evaluation.samples=3"):
         assert identify(changed((override,))).denoiser.key == trained, override
     assert identify(usual(*EXACT)).denoiser is None
 
@@ -132,10 +132,10 @@ def test_data_from_files_count_by_content_and_not_by_place(tmp_path):
 
 
 def test_the_name_is_for_people():
-    assert identify(usual()).name == "lqr/known/normalised/mlp/ddpm/seed=0"
+    assert identify(usual()).name == "lqr/known/normalised/mlp/dpm_solver/seed=0"
     assert identify(changed(("recording.length=300",), HANKEL)).name.startswith("lqr/hankel_lowrank/S=300/w=0.01/")
     assert "known_fixed/" in identify(changed(("projector.initial_state=fixed",))).name
-    assert "ddpm(last_step_noise=False)" in identify(changed(("sampler.last_step_noise=false",))).name
+    assert "dpm_solver(eta=1.0)" in identify(changed(("sampler.eta=1.0",))).name
 
 
 def test_axes_are_flat_and_name_the_choices():

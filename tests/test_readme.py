@@ -15,7 +15,7 @@ from dadiff.reporting.definitions import FOLDER
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
 SMALL = ["dataset.train_size=40", "dataset.test_size=2", "evaluation.samples=1", "schedule.num_steps=30"]
-SMALL += ["training.steps=3", "training.warmup=0", "sampler.skip_below=0", "progress=false"]
+SMALL += ["training.steps=3", "training.warmup=0", "progress=false"]
 
 
 def blocks(language: str) -> list[str]:

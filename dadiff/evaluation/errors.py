@@ -34,6 +34,19 @@ def dynamics_residual(system: System, layout: TrajectoryLayout, tau: np.ndarray)
     return _squared(x[..., 1:, :] - system.step(x[..., :-1, :], u, np.arange(layout.horizon)))
 
 
+def spread(planned: np.ndarray, covariance_trace: float | None = None) -> Scores:
+    """How widely the plans of a case scatter: without it an error is half the story, since the mean has the least.
+
+    `spread` is the trace of the sample covariance of a case's plans, averaged; `spread_ratio` is it over that of the
+    law of demonstrations. One plan a case has neither, and an unknown law or one without spread gives no ratio.
+    """
+    if planned.shape[-2] < 2:
+        return Scores()
+    found = {"spread": float(planned.var(axis=-2, ddof=1).sum(axis=-1).mean())}
+    ratio = {"spread_ratio": found["spread"] / covariance_trace} if covariance_trace else {}
+    return Scores(headline=found | ratio)
+
+
 def tracking_errors(
     system: System, layout: TrajectoryLayout, cases: Cases, planned: np.ndarray, rollout: np.ndarray
 ) -> Scores:

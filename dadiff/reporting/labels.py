@@ -56,6 +56,8 @@ METRICS = {
     "projection_seconds": "time per projection [s]",
     "projector_setup_seconds": "projector set-up [s]",
     "network_calls": "network calls",
+    "spread": "spread of a case's plans, trace of the covariance",
+    "spread_ratio": "spread / spread of the demonstrations' law",
     "collision_rollout": "share in collision after replay",
     "collision_planned": "share in collision, as planned",
     "waypoint_distance_1_planned": "distance to waypoint 1, as planned [m]",

@@ -224,6 +224,13 @@ class Experiment:
             )
         return task.law(self.target)
 
+    @property
+    def covariance_trace(self) -> float | None:
+        """Of the law of demonstrations given E, averaged over robots; None where the law is not known."""
+        if not isinstance(self.parts.task, Lawful):
+            return None
+        return float(np.square(self.law.noise_map).sum(axis=(-2, -1)).mean())
+
     def _cached(self, artefact: Artefact, build: Callable[[Path], None], *, resumable: bool = False) -> Path:
         return self.cache.get_or_build(artefact.kind, artefact.key, artefact.determined_by, build, resumable=resumable)
 

@@ -16,7 +16,7 @@ import yaml
 
 from dadiff.behaviours import Known, compared, pins, prediction_error
 from dadiff.diffusion.chain import Samples
-from dadiff.evaluation import ClosedLoop, replay, tracking_errors
+from dadiff.evaluation import ClosedLoop, replay, spread, tracking_errors
 from dadiff.evaluation.closed_loop import Bench, latencies, means
 from dadiff.evaluation.mahalanobis import MahalanobisDistance
 from dadiff.evaluation.records import ChainRecorder, Snapshots, headline, merged, tables
@@ -167,6 +167,7 @@ def evaluate(experiment: Experiment, planned: np.ndarray) -> Scores:
     rollout = replay(system, layout, planned, cases.x_init)
     return merged(
         tracking_errors(system, layout, cases, planned, rollout),
+        spread(planned, experiment.covariance_trace),
         experiment.parts.task.score(system, cases, planned, rollout),
     )
 

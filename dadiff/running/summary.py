@@ -12,6 +12,8 @@ COLUMNS = {
     "replayed": "rollout_state_error",
     "plan-replay gap": "gap",
     "cost ratio": "cost_ratio",
+    "spread": "spread",
+    "of the law's": "spread_ratio",
     "calls": "network_calls",
     "seconds": "sampling_seconds",
 }
