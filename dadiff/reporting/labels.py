@@ -9,6 +9,7 @@ from typing import Any
 PROJECTORS = {
     "none": "vanilla",
     "known": "known FF†",
+    "known_converged": "known, ten sweeps",
     "hankel": "Hankel HH†",
     "hankel_lowrank": "Hankel, truncated",
     "identified": "identified (A, B)",
@@ -20,6 +21,9 @@ ENFORCEMENTS = {
     "normalised": "every step",
     "convex": "convex",
     "clean_estimate": "on the clean estimate",
+    "conditional": "conditional",
+    "conditional_standardised": "every step, standardised metric",
+    "conditional_physical": "every step, physical metric",
     "literal": "as printed",
 }
 WORDS: dict[str, dict[str, str]] = {
