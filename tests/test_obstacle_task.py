@@ -13,7 +13,7 @@ from dadiff.experts.obstacles import literal
 from dadiff.experts.obstacles.problem import ObstacleProblem
 from dadiff.systems import double_integrator
 from dadiff.tasks.environments import Environments, decode, encode
-from dadiff.tasks.obstacle_scores import collision_scores, side_scores, waypoint_scores
+from dadiff.tasks.obstacle_scores import choice, collision_scores, side_scores, success_scores, waypoint_scores
 from dadiff.tasks.obstacles import Obstacles
 from dadiff.tasks.task import Cases
 
@@ -131,6 +131,7 @@ def test_more_obstacles_than_a_model_has_slots_for_are_refused(cases: Cases) -> 
         ({"horizon": 1}, "horizon is 1"),
         ({"margin": -0.1}, "margin is -0.1"),
         ({"input_cost": 0.0}, "input_cost is 0.0"),
+        ({"waypoint_tolerance": 0.0}, "waypoint_tolerance is 0.0"),
         ({"box": 0.3}, "box is 0.3"),
         ({"waypoint_times": [33, 5]}, "waypoint_times are"),
         ({"waypoint_times": [5, 40]}, "waypoint_times are"),
@@ -221,6 +222,39 @@ def test_the_expert_scores_perfectly_and_a_straight_run_collides(cases: Cases) -
     scores = freely.score(SYSTEM, cases, through, through)
     assert 0.4 < scores.per_plan["collision_planned"].mean() < 0.7
     assert (scores.per_plan["cost_ratio"] <= 1 + 1e-9).all()
+
+
+def test_success_is_to_keep_clear_and_to_pass_the_waypoints() -> None:
+    e, plans = one_disc(), paths(ABOVE, BELOW, INSIDE)
+    collisions, _ = collision_scores(e, plans)
+    scores = {f"{k}_rollout": v for k, v in (collisions | waypoint_scores(e, plans)).items()}
+    np.testing.assert_array_equal(success_scores(scores, tolerance=0.1), [[1, 0, 0]])
+    np.testing.assert_array_equal(success_scores(scores, tolerance=2.0), [[1, 1, 0]])
+    scores["waypoint_distance_1_rollout"] = np.full((1, 3), np.nan)  # an environment without that waypoint
+    np.testing.assert_array_equal(success_scores(scores, tolerance=0.1), [[1, 1, 0]])
+
+
+def test_the_plan_chosen_is_the_cheapest_that_is_clear_or_else_the_one_that_enters_least() -> None:
+    cost, nothing = np.array([[3.0, 1, 2]]), np.full((1, 3), np.nan)
+    np.testing.assert_array_equal(choice(cost, np.array([[0.1, -0.1, 0.0]])), [[False, False, True]])
+    np.testing.assert_array_equal(choice(cost, np.array([[-0.1, -0.3, -0.2]])), [[True, False, False]])
+    np.testing.assert_array_equal(choice(cost, nothing), [[False, True, False]])
+
+
+def test_scores_of_chosen_and_successful_plans_leave_out_the_others(cases: Cases) -> None:
+    good = cases.reference
+    bad = good + 1.0
+    plans = np.stack([bad, good, bad], axis=1)
+    scores = Obstacles().score(SYSTEM, cases, plans, plans)
+    np.testing.assert_array_equal(scores.per_plan["success"], np.tile([0.0, 1.0, 0.0], (200, 1)))
+    assert scores.headline["successful_plans"] == 200
+    kept = scores.per_plan["cost_ratio_successful"]
+    np.testing.assert_allclose(kept[:, 1], 1)
+    assert np.isnan(kept[:, [0, 2]]).all()
+    for name, expected in (("success", 1), ("collision", 0), ("state_error", 0), ("cost_ratio", 1)):
+        found = scores.per_plan[f"{name}_chosen"]
+        assert (~np.isnan(found)).sum(axis=1).tolist() == [1] * 200
+        np.testing.assert_allclose(np.nanmean(found), expected, atol=1e-12)
 
 
 # --- the printed cost -----------------------------------------------------------------------------------------------

@@ -6,6 +6,8 @@ Discs are the true ones, without the planning margin. Positions are (N, S, T+1, 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from dadiff.tasks.environments import Environments
@@ -42,6 +44,29 @@ def waypoint_scores(environments: Environments, positions: np.ndarray) -> dict[s
             scores[f"waypoint_distance_{k + 1}"] = np.where(e.due[:, None, k], distance, np.nan)
     scores["waypoint_distance_target"] = np.linalg.norm(positions[:, :, -1] - e.target[:, None], axis=-1)
     return scores
+
+
+def success_scores(scores: Mapping[str, np.ndarray], tolerance: float, suffix: str = "_rollout") -> np.ndarray:
+    """1 for each plan that keeps clear of the discs and passes within a tolerance of waypoints and target, (N, S).
+
+    Args:
+        scores: `collision` and the `waypoint_distance`s, their names with the suffix.
+        tolerance: in metres.
+    """
+    distances = [v for name, v in scores.items() if name.startswith("waypoint_distance") and name.endswith(suffix)]
+    reached = np.all([~(distance > tolerance) for distance in distances], axis=0)  # nan where there is no waypoint
+    return (reached & (scores[f"collision{suffix}"] == 0)).astype(float)
+
+
+def choice(cost: np.ndarray, clearance: np.ndarray) -> np.ndarray:
+    """Which plan of an environment to take, (N, S), knowing their costs and clearances only, (N, S) each.
+
+    The cheapest of those that keep clear of the discs; where none does, the one that enters them least.
+    """
+    clear = ~(clearance < 0)  # nan where there is no disc
+    cheapest = np.where(clear, cost, np.inf).argmin(axis=1)
+    taken = np.where(clear.any(axis=1), cheapest, np.where(clear, 0.0, clearance).argmax(axis=1))
+    return np.arange(cost.shape[1]) == taken[:, None]
 
 
 def side_scores(environments: Environments, positions: np.ndarray, expert: np.ndarray) -> dict[str, np.ndarray]:

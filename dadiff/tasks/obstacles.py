@@ -21,7 +21,7 @@ from dadiff.systems import System
 from dadiff.tasks import environments as env
 from dadiff.tasks.environments import Environments
 from dadiff.tasks.obstacle_distribution import ANNULUS, ObstacleDistribution
-from dadiff.tasks.obstacle_scores import collision_scores, side_scores, waypoint_scores
+from dadiff.tasks.obstacle_scores import choice, collision_scores, side_scores, success_scores, waypoint_scores
 from dadiff.tasks.task import Cases, Demonstrations, Scores
 from dadiff.trajectory import Layout
 
@@ -48,6 +48,7 @@ class Obstacles:
         start_range: x_init ~ U[-s, s]^4.
         box: target and obstacles in U[-b, b]^2, in metres.
         margin: by which the expert inflates discs, in metres; scores use the true discs.
+        waypoint_tolerance: how far from waypoints and target a successful plan may pass, in metres.
         waypoint_weight: cost of a squared metre at a waypoint or the target.
         input_cost: rho, R = rho I. At 1e-4 the optimum passes waypoints within centimetres, as in the paper's figures.
         distribution: "default" draws 60 % of the discs in the way, "uniform" none on purpose; "hard" draws as many as
@@ -64,6 +65,7 @@ class Obstacles:
     start_range: float = 1.0
     box: float = 4.0
     margin: float = 0.05
+    waypoint_tolerance: float = 0.15
     waypoint_weight: float = 1.0
     input_cost: float = 1e-4
     distribution: Literal["default", "uniform", "hard"] = "default"
@@ -74,7 +76,7 @@ class Obstacles:
         for name, least in (("horizon", 2), ("max_waypoints", 0), ("max_obstacles", 0), ("margin", 0)):
             if (value := getattr(self, name)) < least:
                 raise ConfigError(f"task: {name} is {value}; it must be at least {least}")
-        for name in ("start_range", "waypoint_weight", "input_cost"):
+        for name in ("start_range", "waypoint_tolerance", "waypoint_weight", "input_cost"):
             if not (value := getattr(self, name)) > 0:
                 raise ConfigError(f"task: {name} is {value}; it must be positive")
         if not self.box >= ANNULUS[0]:
@@ -182,7 +184,11 @@ class Obstacles:
         return ObstacleProblem(e.x_init, goal, weight, e.centre, radius, self.input_cost, time_step)
 
     def score(self, system: System, cases: Cases, planned: np.ndarray, rollout: np.ndarray) -> Scores:
-        """Collisions, waypoints and sides of plans (cases, samples, d), and the cost of replaying them."""
+        """Collisions, waypoints and sides of plans (cases, samples, d); success and cost after replay, and choices.
+
+        Success is to keep clear of the discs and within `waypoint_tolerance` of waypoints and target. What ends in
+        `_chosen` is that of the plan of each case which the planner would pick, knowing its own plans and E only.
+        """
         environments, layout = self.decode(cases.environment), system.layout(self.horizon)
         expert = layout.states(cases.reference)[..., :2]
         scores = Scores()
@@ -192,12 +198,32 @@ class Obstacles:
             named = collisions | waypoint_scores(environments, positions) | side_scores(environments, positions, expert)
             scores.per_plan.update({f"{name}_{suffix}": value for name, value in named.items()})
             scores.per_step[f"inside_{suffix}"] = inside
+        scores.per_plan["success"] = success_scores(scores.per_plan, self.waypoint_tolerance)
         if self.formulation != "literal":  # whose expert minimises another cost, which can be negative
-            problem = self.problem(environments, time_step_of(system))
-            optimum = problem.cost(expert, layout.inputs(cases.reference))
-            cost = problem.cost(layout.states(rollout)[..., :2], layout.inputs(rollout))
-            scores.per_plan["cost_ratio"] = cost / optimum[:, None]
+            self._score_cost(system, cases, planned, rollout, scores)
         return scores
+
+    def _score_cost(
+        self, system: System, cases: Cases, planned: np.ndarray, rollout: np.ndarray, scores: Scores
+    ) -> None:
+        """Cost of replays over that of the reference; of successes alone; and scores of the plans that are chosen."""
+        layout, problem = (
+            system.layout(self.horizon),
+            self.problem(self.decode(cases.environment), time_step_of(system)),
+        )
+
+        def cost(tau: np.ndarray) -> np.ndarray:
+            return problem.cost(layout.states(tau)[..., :2], layout.inputs(tau))
+
+        named, reference = scores.per_plan, cases.reference[:, None]
+        named["cost_ratio"] = cost(rollout) / cost(reference)
+        named["cost_ratio_successful"] = np.where(named["success"] > 0, named["cost_ratio"], np.nan)
+        scores.headline["successful_plans"] = float(named["success"].sum())
+        error = np.square(layout.states(planned) - layout.states(reference)).sum(axis=-1).mean(axis=-1)
+        chosen = choice(cost(planned), named["clearance_planned"])
+        of_chosen = {"success": named["success"], "collision": named["collision_rollout"], "state_error": error}
+        of_chosen |= {"cost_ratio": named["cost_ratio"]}
+        named.update({f"{name}_chosen": np.where(chosen, value, np.nan) for name, value in of_chosen.items()})
 
     def distribution_for(self, time_step: float) -> ObstacleDistribution:
         """Where environments are drawn from."""

@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from dadiff.reporting.aggregation import Evidence, Method, varying
+from dadiff.reporting.aggregation import Evidence, Method, has_metric, varying
 from dadiff.reporting.figures.style import INK, letter, log_axis, look_of, panels
 from dadiff.reporting.labels import FLOORS, method_name, metric_name
 from dadiff.reporting.selection import Selector
@@ -98,7 +98,7 @@ def collect(
     best: dict[str, float] | None = None,
     group: str | None = None,
 ) -> Methods:
-    """The methods that `cells` asks for, diverged ones named in their place.
+    """The methods that `cells` asks for, diverged ones named in their place; metrics that none has are left out.
 
     Args:
         group: of a fleet, the robots of this group alone.
@@ -106,10 +106,11 @@ def collect(
     """
     methods = evidence.methods(cells)
     shown, alive = varying(methods), [method for method in methods if method.finished]
-    rows = [[_row(method, metric, shown, group) for method in methods] for metric in metrics] if alive else []
+    kept = [name for name in metrics if any(has_metric(method.finished, name) for method in alive)]
+    rows = [[_row(method, metric, shown, group) for method in methods] for metric in kept]
     robots = any("robots" in method.counts() for method in alive)
     notes = [f"{method_name(m.axes, shown)}: {m.outcome}" for m in methods if m.lost]
-    return Methods(metrics if alive else [], rows, "robot" if robots else "case", log, best or {},
+    return Methods(kept, rows, "robot" if robots else "case", log, best or {},
                    [key for m in alive for key in m.keys], notes)  # fmt: skip
 
 
