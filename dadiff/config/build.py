@@ -12,6 +12,7 @@ import importlib
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import is_dataclass
+from functools import cache
 from typing import Any, get_type_hints
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
@@ -40,7 +41,7 @@ def build(node: Mapping[str, Any], where: str, trusted: Sequence[str] = ()) -> A
 
 def defaults(target: Callable[..., Any]) -> dict[str, Any]:
     """The parameters that a target does not need to be given."""
-    parameters = inspect.signature(target).parameters.items()
+    parameters = _parameters(target).items()
     return {name: parameter.default for name, parameter in parameters if parameter.default is not parameter.empty}
 
 
@@ -50,9 +51,14 @@ def resolve(node: Mapping[str, Any], where: str, trusted: Sequence[str] = ()) ->
     Raises:
         ConfigError: if it is missing, not trusted, cannot be found, or is no component of the node's group.
     """
-    path, roots = node.get(TARGET), {"dadiff", *trusted}
+    path = node.get(TARGET)
     if not isinstance(path, str) or "." not in path:
         raise ConfigError(f"{where}: {TARGET} is {path!r}; expected the dotted name of a class or function")
+    return _found(path, where, frozenset({"dadiff", *trusted}))
+
+
+@cache
+def _found(path: str, where: str, roots: frozenset[str]) -> Callable[..., Any]:
     if path.split(".")[0] not in roots:
         raise ConfigError(
             f"{where}: {TARGET} {path} lies outside dadiff and is not built; "
@@ -72,10 +78,8 @@ def resolve(node: Mapping[str, Any], where: str, trusted: Sequence[str] = ()) ->
 
 def check(node: Mapping[str, Any], target: Callable[..., Any], where: str) -> dict[str, Any]:
     """The node's parameters, checked against the target's signature."""
-    parameters = inspect.signature(target).parameters
-    plain_class = inspect.isclass(target) and not is_dataclass(target)
     try:
-        hints = get_type_hints(target.__init__ if plain_class else target)
+        parameters, hints = _parameters(target), _hints(target)
     except (NameError, TypeError) as error:
         raise ConfigError(f"{where}: the annotations of {target.__qualname__} cannot be read ({error})") from error
     given = {key: value for key, value in node.items() if key != TARGET}
@@ -91,6 +95,25 @@ def check(node: Mapping[str, Any], target: Callable[..., Any], where: str) -> di
     return {key: _typed(value, hints[key], f"{where}: {key}") for key, value in given.items()}
 
 
+@cache
+def _parameters(target: Callable[..., Any]) -> Mapping[str, inspect.Parameter]:
+    """Of a target; read once, since a sweep asks for every cell."""
+    return inspect.signature(target).parameters
+
+
+@cache
+def _hints(target: Callable[..., Any]) -> dict[str, Any]:
+    """The types of a target's parameters."""
+    plain_class = inspect.isclass(target) and not is_dataclass(target)
+    return get_type_hints(target.__init__ if plain_class else target)
+
+
+@cache
+def _adapter(hint: Any) -> TypeAdapter[Any]:
+    """What checks values of a type; made once."""
+    return TypeAdapter(hint, config=STRICT)
+
+
 def _unknown(key: str, known: list[str]) -> str:
     close = difflib.get_close_matches(key, known, 1)
     advice = f"did you mean {close[0]}?" if close else f"known keys: {', '.join(known) or 'none'}"
@@ -99,7 +122,7 @@ def _unknown(key: str, known: list[str]) -> str:
 
 def _typed(value: Any, hint: Any, where: str) -> Any:
     try:
-        return TypeAdapter(hint, config=STRICT).validate_python(value)
+        return _adapter(hint).validate_python(value)
     except ValidationError as error:
         first = error.errors()[0]
         raise ConfigError(f"{where} is {first['input']!r}: {first['msg'][0].lower()}{first['msg'][1:]}") from error

@@ -33,7 +33,8 @@ def plain(config: DictConfig, choices: Mapping[str, str]) -> dict[str, Any]:
         ConfigError: if a mandatory value is missing or an interpolation leads nowhere.
     """
     try:
-        content = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
+        own = [str(key) for key in config if key != "hydra"]
+        content = OmegaConf.masked_copy(config, own) if "hydra" in config else config
         result: Any = OmegaConf.to_container(content, resolve=True, throw_on_missing=True)
     except MissingMandatoryValue as error:
         raise ConfigError(f"{error.full_key} is missing; give {error.full_key}=...") from error

@@ -63,8 +63,7 @@ class SweepLauncher(Launcher):
         return [JobReturn(overrides=list(cell), status=JobStatus.COMPLETED) for cell in job_overrides]
 
     def _launch(self, job_overrides: Sequence[Sequence[str]]) -> int:
-        composed = [self.composer.load_sweep_config(self.config, list(cell)) for cell in job_overrides]
-        plan = make_plan([plain(config, config.hydra.runtime.choices) for config in composed])
+        plan = make_plan([plain(*self.composer.cell(self.config, cell)) for cell in job_overrides])
         if plan.cells[0].config.get("dry_run"):
             sys.stdout.write(describe(plan) + "\n")
             return 0
