@@ -6,7 +6,6 @@ Heavy packages are imported when a run begins, so that help and configuration er
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
 from typing import Any
 
 import hydra
@@ -14,9 +13,9 @@ from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
+from dadiff.commands import reported
 from dadiff.config.composed import plain
 from dadiff.config.trust import trust
-from dadiff.errors import DadiffError
 from dadiff.folders import shipped
 from dadiff.interface import components_named, configuration, settle
 
@@ -40,16 +39,9 @@ def one_run(config: dict[str, Any]) -> None:
 
 @hydra.main(version_base="1.3", config_path=str(shipped("conf").absolute()), config_name="config")
 def _application(config: DictConfig) -> None:
-    reported(lambda: one_run(plain(config, HydraConfig.get().runtime.choices)))
-
-
-def reported(work: Callable[[], None]) -> None:
-    """Do the work; an error that the user can mend becomes one line and exit code 1."""
-    try:
-        work()
-    except DadiffError as error:
-        print(f"dadiff: error: {error}", file=sys.stderr)
-        raise SystemExit(1) from error
+    choices = HydraConfig.get().runtime.choices
+    if code := reported("dadiff", lambda: one_run(plain(config, choices))):
+        raise SystemExit(code)
 
 
 def check_what_is_printed(arguments: list[str]) -> None:
@@ -66,8 +58,9 @@ def main() -> None:
     """Entry point."""
     settle()
     trust(components_named(get_args_parser().parse_args(sys.argv[1:]).overrides))
-    reported(lambda: check_what_is_printed(sys.argv[1:]))
-    reported(_application)
+    raise SystemExit(
+        reported("dadiff", lambda: check_what_is_printed(sys.argv[1:])) or reported("dadiff", _application)
+    )
 
 
 if __name__ == "__main__":

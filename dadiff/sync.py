@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import argparse
 import logging
-import sys
 from collections import defaultdict
 from pathlib import Path
 
-from dadiff.errors import DadiffError
+from dadiff.commands import reported
 from dadiff.store import Results, StoredRun, Sweeps
 from dadiff.tracking import Tracking
 
@@ -47,10 +46,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--uri", help="the MLflow store (that of each run's configuration)")
     given = parser.parse_args(arguments)
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
-    try:
-        brought = sync(given.output_dir, given.uri)
-    except DadiffError as error:
-        print(f"dadiff-sync: {error}", file=sys.stderr)
-        return 1
-    print(f"{brought} were missing in MLflow and are there now")
-    return 0
+    return reported("dadiff-sync", lambda: print(_told(sync(given.output_dir, given.uri))))
+
+
+def _told(brought: int) -> str:
+    return f"{brought} were missing in MLflow and are there now"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -12,7 +11,7 @@ import torch
 from safetensors.torch import save_file
 
 from dadiff.denoisers import MLP, EncoderDecoder, Gaussian
-from dadiff.denoisers.checkpoints import load, save
+from dadiff.denoisers.checkpoints import load, save, write
 from dadiff.denoisers.exact import ExactDenoiser
 from dadiff.denoisers.learned import CHUNK, NetworkDenoiser
 from dadiff.denoisers.prediction import loss_weights, prediction
@@ -317,7 +316,7 @@ def test_files_that_are_no_models(tmp_path):
     save_file({"a": torch.zeros(1)}, path, metadata={"dadiff": "[1]"})
     with pytest.raises(CheckpointError, match="description is a list"):
         load_small(path)
-    save_file({"a": torch.zeros(1)}, path, metadata={"dadiff": json.dumps(build(RECIPES[1]).description)})
+    write(path, {"a": torch.zeros(1)}, build(RECIPES[1]).description)
     with pytest.raises(CheckpointError, match="tensor environment_mean is missing"):
         load_small(path)
 

@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from dadiff.tracking.markers import Marker, read_marker, write_marker
 
 from dadiff.errors import DadiffError, DataError, StoreError
 from dadiff.store import Cache, Cell, Record, Results, Sweep, Sweeps
@@ -19,23 +18,20 @@ from dadiff.store.cli import main as dadiff_cache
 from dadiff.store.names import file_name, key_of, kind_of, sweep_name
 
 KEYS = ("0123456789abcdef", "fedcba9876543210")
-URI = "sqlite:////tmp/mlflow.db"
 
 
 @pytest.fixture
 def store(tmp_path) -> Path:
-    """Two runs, a sweep of both, an entry of the cache that each uses, and a marker of MLflow's."""
+    """Two runs, a sweep of both, and an entry of the cache that each uses."""
     results, cache = Results(tmp_path), Cache(tmp_path)
     for key in KEYS:
-        folder = cache.get_or_build("denoiser", key, {}, lambda folder: np.save(folder / "x.npy", np.arange(5)))
+        cache.get_or_build("denoiser", key, {}, lambda folder: np.save(folder / "x.npy", np.arange(5)))
         table = pd.DataFrame({"t": range(100), "gap": np.linspace(0, 1, 100)})
         results.write(
             Record(key, f"run {key}", "finished", links={"denoiser": key}),
             tables={"per_step": table},
             arrays={"states": np.ones(3)},
         )
-        write_marker(results.folder(key), URI, Marker("a" * 32, "1", complete=True))
-        write_marker(folder, URI, Marker("b" * 32, "1", complete=True))
     Sweeps(tmp_path).write(Sweep("quick", "dadiff -m", {}, [Cell(key, f"run {key}") for key in KEYS]))
     with Sweeps(tmp_path).running("quick"):
         pass
@@ -44,7 +40,6 @@ def store(tmp_path) -> Path:
 
 FILES = (
     f"runs/{KEYS[0]}/run.json",
-    f"runs/{KEYS[0]}/tracking.json",
     f"cache/denoiser/{KEYS[0]}/manifest.json",
     "sweeps/quick/sweep.json",
     "sweeps/quick/launcher.json",
@@ -124,7 +119,6 @@ def test_a_harmed_file_is_told_in_a_line_and_the_rest_goes_on(store, name, harm,
         lambda: sweeps.read("quick"),
         lambda: sweeps.is_running("quick"),
         lambda: Cache(store).contains("denoiser", KEYS[0]),
-        lambda: read_marker(results.folder(KEYS[0]), URI),
         lambda: list(results.damaged()),
     ]
     for read in readers:

@@ -190,6 +190,18 @@ def test_a_truncated_checkpoint_is_refused(tmp_path):
         run(tmp_path / "a")
 
 
+@pytest.mark.parametrize("share", [0.3, 0.5, 0.6, 0.7, 0.8, 0.9, 0.99])
+def test_a_bit_that_flips_in_a_checkpoint_is_found(share, tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path / "a", augment=Interrupt(3))
+    path = tmp_path / "a/checkpoint.safetensors"
+    content = bytearray(path.read_bytes())
+    content[int(share * len(content))] ^= 8
+    path.write_bytes(content)
+    with pytest.raises(CheckpointError, match=r"checkpoint\.safetensors"):
+        run(tmp_path / "a")
+
+
 def test_bad_data_is_named(tmp_path):
     trajectories, E = demonstrations()
     arguments = (RECIPES[0], LAYOUT, CONDITION, SCHEDULE, SHORT)

@@ -5,6 +5,7 @@ Files are written beside their place and renamed: a reader finds the old one or 
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,8 +19,10 @@ from dadiff.denoisers.description import Description, describe, require_equal
 from dadiff.denoisers.learned import NetworkDenoiser
 from dadiff.denoisers.recipes import Recipe
 from dadiff.diffusion.schedule import Schedule
-from dadiff.errors import CheckpointError
+from dadiff.errors import CheckpointError, StoreError
 from dadiff.trajectory import Layout, TrajectoryLayout
+
+CHECKSUM = "sha256"
 
 
 def save(denoiser: NetworkDenoiser, path: Path) -> None:
@@ -46,8 +49,22 @@ def write(path: Path, tensors: Mapping[str, Tensor], description: Description) -
     """Store named tensors and their description, by renaming a whole file into place."""
     temporary = path.with_name(f".{path.name}.partial")  # one name: what a killed writer left is overwritten
     contiguous = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    save_file(contiguous, temporary, metadata={"dadiff": json.dumps(description)})
+    temporary.unlink(missing_ok=True)
+    metadata = {"dadiff": json.dumps(description), CHECKSUM: checksum(contiguous)}
+    try:
+        save_file(contiguous, temporary, metadata=metadata)
+    except SafetensorError as error:
+        raise StoreError(f"{path}: cannot be written ({error})") from error
     temporary.replace(path)
+
+
+def checksum(tensors: Mapping[str, Tensor]) -> str:
+    """SHA-256 over names, types, shapes and values, in hex."""
+    digest = hashlib.sha256()
+    for name, tensor in sorted(tensors.items()):
+        digest.update(f"{name} {_kind(tensor)}".encode())
+        digest.update(tensor.reshape(-1).view(torch.uint8).numpy().data)
+    return digest.hexdigest()
 
 
 def read(path: Path, expected: Description) -> dict[str, Tensor]:
@@ -55,7 +72,10 @@ def read(path: Path, expected: Description) -> dict[str, Tensor]:
     try:
         with safe_open(path, framework="pt") as file:
             require_equal(_description(file.metadata(), path), expected, str(path))
-            return {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            if file.metadata().get(CHECKSUM) != checksum(tensors):
+                raise CheckpointError(f"{path}: differs from its checksum; delete it and train again")
+            return tensors
     except (SafetensorError, OSError) as error:
         reason = "no such file" if isinstance(error, FileNotFoundError) else "truncated or damaged"
         raise CheckpointError(f"{path}: cannot be read as safetensors ({reason}); delete it and train again") from error

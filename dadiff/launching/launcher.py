@@ -10,7 +10,6 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import partial
-from pathlib import Path
 from types import FrameType
 from typing import Any
 
@@ -28,7 +27,6 @@ from dadiff.launching.pool import Pool
 from dadiff.launching.sweep import SweepRun, summary
 from dadiff.launching.table import Table
 from dadiff.launching.work import Running, Work
-from dadiff.outside import text_of, without_passwords
 from dadiff.store import DONE, Lease, Sweeps
 
 
@@ -68,7 +66,6 @@ class SweepLauncher(Launcher):
             sys.stdout.write(describe(plan) + "\n")
             return 0
         name = self.sweep or self.config.hydra.runtime.choices.get("sweeps")
-        _conceal(Path(plan.cells[0].config["output_dir"]) / "multirun.yaml")
         run = SweepRun.of(plan, name, "dadiff " + shlex.join(sys.argv[1:]), definition(self.config))
         with Sweeps(run.output_dir).running(run.name) as lease:
             return self._run(run, lease)
@@ -133,12 +130,6 @@ def definition(config: DictConfig) -> dict[str, str]:
     given = (str(override).partition("=") for override in config.hydra.overrides.task)
     params = {str(name): str(value) for name, value in (config.hydra.sweeper.get("params") or {}).items()}
     return params | {name.lstrip("+~"): value for name, _, value in given}
-
-
-def _conceal(path: Path) -> None:
-    """Remove passwords from what Hydra writes of a multirun."""
-    if path.is_file() and (text := text_of(path)) != (shown := without_passwords(text)):
-        path.write_text(shown)
 
 
 @contextmanager

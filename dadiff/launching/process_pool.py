@@ -87,11 +87,14 @@ class ProcessPool(Pool[Process]):
         for entry in running:
             entry.process.terminate()
         deadline = time.monotonic() + GRACE_SECONDS
-        for entry in running:
-            entry.process.join(max(0.0, deadline - time.monotonic()))
-            if entry.process.exitcode is None:
-                entry.process.kill()
-                entry.process.join()
+        try:
+            for entry in running:
+                entry.process.join(max(0.0, deadline - time.monotonic()))
+        finally:  # a second interrupt does not wait
+            for entry in running:
+                if entry.process.exitcode is None:
+                    entry.process.kill()
+                    entry.process.join()
 
 
 def _start_server(threads: int) -> None:

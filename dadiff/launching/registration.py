@@ -48,6 +48,15 @@ class RaySchema:
     sweep: str | None = None
 
 
+@dataclass
+class CellsSchema:
+    """The sweeper `cells`, as Hydra's `basic`."""
+
+    _target_: str = "dadiff.launching.sweeper.CellSweeper"
+    max_batch_size: int | None = None
+    params: dict[str, str] | None = None
+
+
 def register() -> None:
     """Register launchers and their schemas, and guard what Hydra does on its own.
 
@@ -58,10 +67,12 @@ def register() -> None:
     from hydra.core.plugins import Plugins
     from hydra.plugins.plugin import Plugin
 
+    plugins = Plugins.instance()  # which loads Hydra's own anew, so that ours may extend them only from here on
     from dadiff.launching.guard import install
     from dadiff.launching.processes import ProcessesLauncher
     from dadiff.launching.ray import RayLauncher
     from dadiff.launching.slurm import SlurmLauncher
+    from dadiff.launching.sweeper import CellSweeper
 
     Plugins.is_in_toplevel_plugins_module = staticmethod(_is_plugin)  # type: ignore[assignment]
     launchers: dict[str, tuple[type[Plugin], type]] = {
@@ -70,8 +81,10 @@ def register() -> None:
         "ray": (RayLauncher, RaySchema),
     }
     for name, (launcher, schema) in launchers.items():
-        Plugins.instance().register(launcher)
+        plugins.register(launcher)
         ConfigStore.instance().store(group="hydra/launcher", name=f"{name}_schema", node=schema)
+    plugins.register(CellSweeper)
+    ConfigStore.instance().store(group="hydra/sweeper", name="cells", node=CellsSchema)
     install()
 
 

@@ -80,7 +80,7 @@ def _row(entry: Running) -> str:
 
 def last_line(path: Path) -> str:
     """The end of a log, where progress is."""
-    if not path.exists():
+    if not path.is_file():
         return ""
     with path.open("rb") as stream:
         stream.seek(max(0, path.stat().st_size - 400))

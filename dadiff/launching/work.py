@@ -125,7 +125,8 @@ def environment(variables: Mapping[str, str]) -> Iterator[None]:
 
 
 def _redirect(log_file: Path) -> None:
-    descriptor = os.open(log_file, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND, 0o644)
+    log_file.unlink(missing_ok=True)  # where a link led, nothing is written
+    descriptor = os.open(log_file, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o666)
     for stream in (1, 2):
         os.dup2(descriptor, stream)
     os.close(descriptor)

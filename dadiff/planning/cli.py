@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from dadiff.errors import DadiffError, DataError
+from dadiff.commands import reported
+from dadiff.errors import DataError
 
 DESCRIPTION = """Plans of a trained planner, for one condition.
 
@@ -22,11 +22,8 @@ or, where it has more than numbers, in a yaml file with the same names:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point; an error that the user can mend becomes one line and exit code 1."""
     options, rest = _parser().parse_known_args(arguments)
-    try:
-        _plan(options, _fields(rest))
-    except DadiffError as error:
-        print(f"dadiff-plan: error: {error}", file=sys.stderr)
-        raise SystemExit(1) from error
+    if code := reported("dadiff-plan", lambda: _plan(options, _fields(rest))):
+        raise SystemExit(code)
 
 
 def _parser() -> argparse.ArgumentParser:

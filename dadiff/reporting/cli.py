@@ -5,11 +5,10 @@ from __future__ import annotations
 import argparse
 import logging
 import shlex
-import sys
 import tempfile
 from pathlib import Path
 
-from dadiff.errors import DadiffError
+from dadiff.commands import reported
 from dadiff.store import Results, Sweeps
 from dadiff.tracking import Tracking
 
@@ -34,13 +33,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Write one report; 0 if it was written."""
     logging.basicConfig(format="%(message)s")
     options = _parser().parse_args(arguments)
-    try:
-        index = write(options)
-    except DadiffError as error:
-        print(f"dadiff-report: {error}", file=sys.stderr)
-        return 1
-    print(f"report: {index}")
-    return 0
+    return reported("dadiff-report", lambda: print(f"report: {write(options)}"))
 
 
 def write(options: argparse.Namespace) -> Path:

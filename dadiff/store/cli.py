@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import argparse
 import shutil
-import sys
 from collections import Counter
 from pathlib import Path
 
-from dadiff.errors import DadiffError, StoreError
+from dadiff.commands import reported
+from dadiff.errors import StoreError
 from dadiff.memory import in_words
 from dadiff.store.cache import Cache, Entry, damage
 from dadiff.store.folder import is_store
@@ -92,16 +92,16 @@ def _parser() -> argparse.ArgumentParser:
 def main(arguments: list[str] | None = None) -> int:
     """The command line; returns its exit code, 1 if `verify` found damage."""
     given = _parser().parse_args(arguments)
-    try:
-        if given.action == "list":
-            lines, code = list_entries(given.output_dir), 0
-        elif given.action == "verify":
-            damaged = verify(given.output_dir)
-            lines, code = damaged or ["every entry agrees with its checksums"], int(bool(damaged))
-        else:
-            lines, code = prune(given.output_dir, dry_run=given.dry_run) or ["nothing to remove"], 0
-    except DadiffError as error:
-        print(f"dadiff-cache: {error}", file=sys.stderr)
-        return 1
+    return reported("dadiff-cache", lambda: _act(given.action, given.output_dir, given.dry_run))
+
+
+def _act(action: str, output_dir: Path, dry_run: bool) -> int:
+    if action == "list":
+        lines, code = list_entries(output_dir), 0
+    elif action == "verify":
+        damaged = verify(output_dir)
+        lines, code = damaged or ["every entry agrees with its checksums"], int(bool(damaged))
+    else:
+        lines, code = prune(output_dir, dry_run=dry_run) or ["nothing to remove"], 0
     print("\n".join(lines))
     return code

@@ -1,0 +1,40 @@
+"""How every command line ends: what a person can mend is one line, and the exit code says which end it was."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable
+
+from dadiff.errors import DadiffError
+
+FAILED, INTERRUPTED, UNHEARD = 1, 130, 141
+
+
+def reported(program: str, work: Callable[[], int | None]) -> int:
+    """Do the work; returns the exit code, after one line for an error that the user can mend.
+
+    A full disk, a folder without rights and a lack of memory are such errors, wherever they occur.
+    """
+    try:
+        return work() or 0
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nobody reads what would still be flushed
+        return UNHEARD
+    except (DadiffError, OSError, MemoryError) as error:
+        sys.stderr.write(f"{program}: error: {in_one_line(error)}\n")
+        return FAILED
+    except KeyboardInterrupt as error:
+        said = f" ({error})" if str(error) else ""
+        sys.stderr.write(f"{program}: interrupted{said}; the same command goes on from what is stored\n")
+        return INTERRUPTED
+
+
+def in_one_line(error: BaseException) -> str:
+    """What an error says; of the system's own, the file and the reason."""
+    if isinstance(error, MemoryError):
+        return f"out of memory {error}".strip()
+    if isinstance(error, OSError) and error.strerror:
+        place = f"{error.filename}: " if error.filename else ""
+        return f"{place}{error.strerror}"
+    return " ".join(str(error).split())
