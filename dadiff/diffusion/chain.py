@@ -107,14 +107,10 @@ def sample(
     bar = tqdm(steps, desc="sampling", unit="step", disable=None if progress else True, leave=False)
     for step in bar:  # line 2: for i = L, ..., 1
         at = Context(step, schedule, tau, environment, project or unprojected, ask, noise, estimate, memory)
-        mean = step.sample * tau
-        if step.call:  # line 3: the clean estimate from tau_i, i and E, and the mean that follows from it
-            before, tau0_hat = tau0_hat, by.clean(ask(tau, step.i, environment), at)
-            mean = mean + step.clean * tau0_hat + step.previous * before
-        tau = mean + step.noise * noise() if step.noise else mean  # line 4: predict
+        predicted, tau0_hat = predict(at, by, tau0_hat)
         if observe:
-            observe(step.j, "predict", tau)
-        tau = by.sample(tau, at)  # line 5: project
+            observe(step.j, "predict", predicted)
+        tau = by.sample(predicted, at)  # line 5: project
         if observe:
             observe(step.j, "project", tau)
         if not tau.abs().max() <= divergence_bound:
@@ -123,3 +119,16 @@ def sample(
     if observe:
         observe(0, "end", tau)
     return Samples(tau, ask.calls, diverged_at=None if tau.abs().max() <= divergence_bound else 0)
+
+
+def predict(at: Context, by: Enforcement, before: Tensor) -> tuple[Tensor, Tensor]:
+    """Lines 3 and 4 of Algorithm 1 at one step: tau_j before it is projected, and the clean estimate that it rests on.
+
+    Args:
+        before: the clean estimate of the step before, which multistep samplers use and steps without a call pass on.
+    """
+    step, mean, tau0_hat = at.step, at.step.sample * at.tau, before
+    if step.call:  # line 3: the clean estimate from tau_i, i and E, and the mean that follows from it
+        tau0_hat = by.clean(at.denoise(at.tau, step.i, at.environment), at)
+        mean = mean + step.clean * tau0_hat + step.previous * before
+    return mean + step.noise * at.noise() if step.noise else mean, tau0_hat  # line 4: predict
