@@ -28,7 +28,6 @@ from dadiff.diffusion.context import Context, Counted, unprojected
 from dadiff.diffusion.enforcement import Enforcement, Never
 from dadiff.diffusion.samplers import Step
 from dadiff.errors import NotApplicableError
-from dadiff.experts.lqr import GaussianLaw
 from dadiff.planning import Planner
 from dadiff.trajectory.covariance import Covariance
 
@@ -59,6 +58,7 @@ class Exactness:
         mean_distance: |m - m*|.
         spread: tr S / tr S*; 1 is right, 0 a planner that always draws the same.
         network_calls: of one plan.
+        exact: False where the plans' law was estimated from draws.
         plans: the law of the planner's plans.
         right: p(tau | E, G tau = g).
     """
@@ -69,6 +69,7 @@ class Exactness:
     network_calls: int
     plans: Gaussian = field(repr=False)
     right: Gaussian = field(repr=False)
+    exact: bool = True
 
 
 def exactness(planner: Planner, environment: np.ndarray, truth: Planner | None = None) -> Exactness:
@@ -83,11 +84,42 @@ def exactness(planner: Planner, environment: np.ndarray, truth: Planner | None =
     Raises:
         NotApplicableError: if the denoiser is trained, or a step of the chain is not affine.
     """
-    plans, calls = law_of_plans(planner, environment)
     right = conditional_law(truth or planner, environment)
+    plans, calls = law_of_plans(planner, environment)
     mean = float(np.linalg.norm(plans.mean - right.mean))
-    spread = float(np.trace(plans.covariance) / np.trace(right.covariance))
-    return Exactness(wasserstein(plans, right), mean, spread, calls, plans, right)
+    return Exactness(wasserstein(plans, right), mean, _spread(plans, right), calls, plans, right)
+
+
+def sampled_exactness(
+    planner: Planner, environment: np.ndarray, truth: Planner | None = None, draws: int = 2000, seed: int = 0
+) -> Exactness:
+    """As `exactness`, with the Gaussian of the moments of draws as the plans' law: for chains that are not affine.
+
+    Few draws look far from any law, the one that they are from included. What that adds to the squares of both
+    distances is taken off: the distance of as many draws of the estimated Gaussian from it, and tr S / draws.
+
+    Raises:
+        NotApplicableError: if the chain diverges.
+    """
+    drawn = planner.plan(environment, samples=draws, seed=seed)
+    if drawn.diverged_at is not None:
+        raise NotApplicableError(f"exact: the chain diverges at step {drawn.diverged_at}, so its plans have no law")
+    plans = _moments(planner.coordinates.to_scaled(drawn.tau.reshape(draws, -1)))
+    right = conditional_law(truth or planner, environment)
+    again = np.random.default_rng(seed).standard_normal((draws, len(plans.mean))) @ _root(plans.covariance) + plans.mean
+    distance = wasserstein(plans, right) ** 2 - wasserstein(_moments(again), plans) ** 2
+    mean = float(np.square(plans.mean - right.mean).sum() - np.trace(plans.covariance) / draws)
+    distance, mean = (float(np.sqrt(max(square, 0.0))) for square in (distance, mean))
+    return Exactness(distance, mean, _spread(plans, right), drawn.network_calls, plans, right, exact=False)
+
+
+def _moments(z: np.ndarray) -> Gaussian:
+    """Of rows (N, d)."""
+    return Gaussian(z.mean(axis=0), np.cov(z.T))
+
+
+def _spread(plans: Gaussian, right: Gaussian) -> float:
+    return float(np.trace(plans.covariance) / np.trace(right.covariance))
 
 
 def wasserstein(a: Gaussian, b: Gaussian) -> float:
@@ -131,20 +163,6 @@ def law_of_plans(planner: Planner, environment: np.ndarray) -> tuple[Gaussian, i
         mean, covariance = A @ mean + b, A @ covariance @ A.T + N @ N.T
         calls += asked
     return Gaussian(mean[:d], covariance[:d, :d]), calls
-
-
-def moment_matched(trajectories: np.ndarray, environment: np.ndarray) -> GaussianLaw:
-    """The Gaussian law with the first two moments of demonstrations given E: linear regression and its residual.
-
-    Args:
-        trajectories: (N, d), physical units.
-        environment: (N, c).
-    """
-    regressors = np.concatenate([environment, np.ones((len(environment), 1))], axis=-1)
-    coefficients = np.linalg.lstsq(regressors, trajectories, rcond=None)[0]
-    residual = trajectories - regressors @ coefficients
-    freedom = max(len(residual) - regressors.shape[-1], 1)
-    return GaussianLaw(coefficients[:-1].T, coefficients[-1], _root(residual.T @ residual / freedom))
 
 
 def _prior(planner: Planner, environment: np.ndarray) -> Gaussian:

@@ -1,6 +1,6 @@
 """Denoisers: what estimates the clean trajectory tau_0 from a noised tau_i and the environment E.
 
-    recipes.py      the components: `EncoderDecoder`, `MLP`, `RecordingMLP`, `Gaussian`; light, without torch
+    recipes.py      the components: `EncoderDecoder`, `MLP`, `RecordingMLP`, `Gaussian`, ...; light, without torch
     prediction.py   what a network predicts (clean, noise, velocity) and how the clean estimate follows
     networks.py     the networks
     learned.py      `NetworkDenoiser`: network, prediction, scaling of E; the casts between float64 and float32
@@ -14,6 +14,6 @@ A denoiser is called as `tau0_hat = denoiser(tau, i, environment)` with float64 
 sampler's coordinates, the diffusion step i in 1..L, and E (..., c) in physical units.
 """
 
-from dadiff.denoisers.recipes import MLP, EncoderDecoder, Gaussian, RecordingMLP
+from dadiff.denoisers.recipes import MLP, EncoderDecoder, Gaussian, MomentMatched, RecordingMLP
 
-__all__ = ["MLP", "EncoderDecoder", "Gaussian", "RecordingMLP"]
+__all__ = ["MLP", "EncoderDecoder", "Gaussian", "MomentMatched", "RecordingMLP"]

@@ -43,9 +43,13 @@ class Recipe(Protocol):
 
 @runtime_checkable
 class ExactRecipe(Protocol):
-    """A denoiser that is known and not trained."""
+    """A denoiser that is known and not trained; `matched` tells whether its law is that of the demonstrations' moments.
+
+    Else it is the task's.
+    """
 
     trainable: ClassVar[bool]
+    matched: ClassVar[bool]
 
     def exact(self, law: Law, coordinates: Coordinates, schedule: Schedule, device: str = "cpu") -> ExactDenoiser:
         """The denoiser for the law of the clean trajectories."""
@@ -176,9 +180,20 @@ class Gaussian:
     """The exact posterior mean where the law of demonstrations is Gaussian given E. Nothing is trained."""
 
     trainable: ClassVar[bool] = False
+    matched: ClassVar[bool] = False
 
     def exact(self, law: Law, coordinates: Coordinates, schedule: Schedule, device: str = "cpu") -> ExactDenoiser:
         """The denoiser of one law, in the coordinates in which the sampler works."""
         from dadiff.denoisers.exact import ExactDenoiser
 
         return ExactDenoiser(law, coordinates, schedule, device)
+
+
+@dataclass(frozen=True)
+class MomentMatched(Gaussian):
+    """The posterior mean of the Gaussian law with the demonstrations' first two moments given E.
+
+    It knows of many robots what a Gaussian can know, without a network's error: the prior of the exact bench.
+    """
+
+    matched: ClassVar[bool] = True

@@ -21,6 +21,7 @@ from dadiff.errors import ConfigError, ShapeError
 from dadiff.trajectory.coordinates import Coordinates, standardised
 from dadiff.trajectory.covariance import Covariance
 from dadiff.trajectory.layout import TrajectoryLayout
+from dadiff.trajectory.subspace import regression
 
 KEPT = 64  # covariances that are held, the oldest given up first
 
@@ -64,7 +65,7 @@ class Estimate:
             trajectories: (N, d), physical units.
             environment: E, (N, c).
         """
-        residual = _residual(coordinates.to_scaled(trajectories), environment)
+        _, _, residual = regression(coordinates.to_scaled(trajectories), environment)
         freedom = max(len(residual) - environment.shape[-1] - 1, 1)
         return cls.of_covariance(layout, coordinates, trajectories, residual.T @ residual / freedom)
 
@@ -125,14 +126,9 @@ class Estimate:
             mean = np.einsum("...ii->...", across) / len(self.deviation)
             equal = mean[..., None, None] * np.diag(self.deviation**2)
             values, vectors = np.linalg.eigh((1 - shrinkage) * self.covariance + shrinkage * equal)
-            self._spectra[shrinkage] = np.maximum(values, 0), vectors
+            rounding = values.shape[-1] * np.finfo(np.float64).eps * values[..., -1:]
+            self._spectra[shrinkage] = np.where(values > rounding, values, 0), vectors
         return self._spectra[shrinkage]
-
-
-def _residual(z: np.ndarray, environment: np.ndarray) -> np.ndarray:
-    """z (N, d) less its linear regression on E (N, c) and 1."""
-    regressors = np.concatenate([environment, np.ones((len(environment), 1))], axis=-1)
-    return z - regressors @ np.linalg.lstsq(regressors, z, rcond=None)[0]
 
 
 def _posterior(variance: np.ndarray, alpha_bar: float) -> np.ndarray:

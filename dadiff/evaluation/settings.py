@@ -73,3 +73,21 @@ class ClosedLoop(Evaluation):
                 f"evaluation: rate is {self.rate}, disturbance {self.disturbance}; need a positive number of plans a "
                 "second and a standard deviation of at least 0"
             )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Exact(Evaluation):
+    """Plans as in `Evaluation`, and how far the law that they are drawn from is from the right one.
+
+    Args:
+        robots: of a fleet, how many are judged: those that differ most.
+        draws: plans from which the law is estimated where it has no closed form.
+    """
+
+    robots: int = 4
+    draws: int = 2000
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.robots < 1 or self.draws < 10:
+            raise ConfigError(f"evaluation: robots is {self.robots}, draws {self.draws}; need at least 1 and 10")

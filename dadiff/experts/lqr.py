@@ -18,6 +18,7 @@ import numpy as np
 from dadiff.errors import ConfigError, InfeasibleError
 from dadiff.systems import AffineSystem, Linear
 from dadiff.trajectory.response import along, beside
+from dadiff.trajectory.subspace import regression
 
 
 @dataclass(frozen=True)
@@ -59,6 +60,19 @@ class GaussianLaw:
     mean_map: np.ndarray = field(repr=False)
     offset: np.ndarray = field(repr=False)
     noise_map: np.ndarray = field(repr=False)
+
+    @classmethod
+    def of_demonstrations(cls, trajectories: np.ndarray, environment: np.ndarray) -> GaussianLaw:
+        """The law with the first two moments of demonstrations given E: linear regression, and what it leaves.
+
+        Args:
+            trajectories: (N, d), physical units.
+            environment: (N, c).
+        """
+        coefficients, intercept, residual = regression(trajectories, environment)
+        _, s, Vt = np.linalg.svd(residual, full_matrices=False)
+        freedom = max(len(residual) - environment.shape[-1] - 1, 1)
+        return cls(coefficients.T, intercept, Vt.T * s / np.sqrt(freedom))
 
     def mean(self, ends: np.ndarray) -> np.ndarray:
         """The mean (*robots, ..., d) given [x_init; x_target] (*robots, ..., 2n)."""

@@ -191,15 +191,13 @@ class Experiment:
             return Estimate.of_covariance(self.layout, where, shown.trajectories, covariance)
         return Estimate.of_demonstrations(self.layout, where, shown.trajectories, shown.environment)
 
-    @cached_property
-    def single(self) -> Planner:
-        """The planner of one robot: of a fleet, of its first."""
+    def planner_of(self, robot: int) -> Planner:
+        """The planner of one robot of a fleet, its dimension kept; of one system, the planner."""
         if not isinstance(self.target, Robots):
             return self.planner
-        first = self.target.take([0])
-        sources = {name: _of_first(source) for name, source in self.sources.items()}
-        behaviour = self.parts.projector.fit(self.layout, system=first, **sources)
-        return replace(self.planner, system=first, behaviour=behaviour)
+        one = self.target.take([robot])
+        sources = {name: _of_robot(source, robot) for name, source in self.sources.items()}
+        return replace(self.planner, system=one, behaviour=self.parts.projector.fit(self.layout, system=one, **sources))
 
     @property
     def is_done(self) -> bool:
@@ -217,10 +215,13 @@ class Experiment:
         Raises:
             ConfigError: if the task's law is not Gaussian.
         """
-        task = self.parts.task
+        task, recipe = self.parts.task, self.parts.denoiser
+        if isinstance(recipe, ExactRecipe) and recipe.matched:
+            return GaussianLaw.of_demonstrations(self.demonstrations.trajectories, self.demonstrations.environment)
         if not isinstance(task, Lawful):
             raise ConfigError(
-                "denoiser: the exact denoiser needs a task whose law is Gaussian; use task=lqr or denoiser=mlp"
+                "denoiser: the exact denoiser needs a task whose law is Gaussian; use task=lqr, "
+                "denoiser=moment_matched or denoiser=mlp"
             )
         return task.law(self.target)
 
@@ -264,6 +265,8 @@ class Experiment:
         )
 
 
-def _of_first(source: Any) -> Any:
-    """A recording of the first robot; demonstrations are not a robot's."""
-    return Recording(source.states[:1], source.inputs[:1]) if isinstance(source, Recording) else source
+def _of_robot(source: Any, robot: int) -> Any:
+    """A recording of one robot; demonstrations are not a robot's."""
+    if not isinstance(source, Recording):
+        return source
+    return Recording(source.states[robot : robot + 1], source.inputs[robot : robot + 1])

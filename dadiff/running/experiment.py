@@ -7,20 +7,25 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import torch
 import yaml
 
 from dadiff.behaviours import Known, compared, pins, prediction_error
 from dadiff.diffusion.chain import Samples
-from dadiff.evaluation import ClosedLoop, replay, spread, tracking_errors
+from dadiff.diffusion.enforcement import PostHoc
+from dadiff.errors import NotApplicableError
+from dadiff.evaluation import ClosedLoop, Exact, replay, spread, tracking_errors
 from dadiff.evaluation.closed_loop import Bench, latencies, means
 from dadiff.evaluation.mahalanobis import MahalanobisDistance
 from dadiff.evaluation.records import ChainRecorder, Snapshots, headline, merged, tables
+from dadiff.exact import Exactness, exactness, sampled_exactness
 from dadiff.outside import passwords_removed
+from dadiff.planning import Planner
 from dadiff.planning.files import in_folder
 from dadiff.randomness import numpy_generator, torch_generator
 from dadiff.running.assembly import Experiment
@@ -31,6 +36,7 @@ from dadiff.tasks import Scores
 from dadiff.trajectory import TrajectoryLayout
 
 EXAMPLE_ROBOTS = 3
+EXACT_SCORES = ("exact_distance", "exact_mean_distance", "exact_spread")
 
 
 @dataclass
@@ -142,6 +148,9 @@ def _store(experiment: Experiment, plans: Plans, started: float) -> StoredRun:
             episodes = Bench(experiment.planner, experiment.cases, experiment.parts.evaluation).table()
             written["closed_loop"] = episodes
             metrics |= means(episodes)
+        if isinstance(experiment.parts.evaluation, Exact):
+            written["exact"] = exact_table(experiment, experiment.parts.evaluation)
+            metrics |= {name: float(written["exact"][name].mean()) for name in EXACT_SCORES}
         arrays = examples(experiment, plans)
     record = record_of(
         experiment.identity,
@@ -175,11 +184,38 @@ def evaluate(experiment: Experiment, planned: np.ndarray) -> Scores:
 def latency(experiment: Experiment) -> dict[str, float]:
     """Seconds that one plan for one robot takes, and the share of plans later than the robot asks for."""
     first = experiment.cases.environment[..., :1, :]
-    seconds = latencies(experiment.single, first[:1])  # of a fleet its first robot; of one system, all there is
+    seconds = latencies(experiment.planner_of(0), first[:1])  # of a fleet its first robot; of one system, all there is
     measures = {"plan_latency": float(np.median(seconds)), "plan_latency_p99": float(np.quantile(seconds, 0.99))}
     if isinstance(experiment.parts.evaluation, ClosedLoop):
         measures["deadlines_missed"] = float((seconds > 1 / experiment.parts.evaluation.rate).mean())
     return measures
+
+
+def exact_table(experiment: Experiment, evaluation: Exact) -> pd.DataFrame:
+    """For a few robots that differ most, how far the law of their plans for one case is from the right one.
+
+    See `dadiff.exact`. The right one knows the dynamics, whatever the method knows.
+    """
+    target, rows = experiment.target, []
+    chosen = target.most_different(evaluation.robots) if isinstance(target, Robots) else [0]
+    for robot in map(int, chosen):
+        planner = experiment.planner_of(robot)
+        environment = experiment.cases.environment[..., :1, :]
+        environment = environment[robot : robot + 1] if target.robots else environment
+        known = Known("fixed").fit(experiment.layout, planner.system)
+        truth = replace(planner, behaviour=known, enforcement=PostHoc(), starts_fixed=True)
+        found = exactness_of(planner, environment, truth, evaluation)
+        scores = {name: getattr(found, name) for name in ("distance", "mean_distance", "spread")}
+        rows.append({"robot": robot, **dict(zip(EXACT_SCORES, scores.values(), strict=True)), "exact": found.exact})
+    return pd.DataFrame(rows)
+
+
+def exactness_of(planner: Planner, environment: np.ndarray, truth: Planner, evaluation: Exact) -> Exactness:
+    """In closed form where every step is affine, else from draws."""
+    try:
+        return exactness(planner, environment, truth)
+    except NotApplicableError:
+        return sampled_exactness(planner, environment, truth, evaluation.draws, evaluation.seed)
 
 
 def examples(experiment: Experiment, plans: Plans) -> dict[str, np.ndarray]:

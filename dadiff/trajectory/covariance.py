@@ -99,13 +99,16 @@ class Covariance:
 
             gain = C E' (E C E')^+,    C - gain E C
 
-        It has the same form, with D = 0 and U = 0 at the known entries.
+        It has the same form, with D = 0 and U = 0 at the known entries. Those whose variance is rounding were known
+        before, and move nothing.
 
         Returns:
             (C given E z, gain (*batch, d, k)).
         """
         D, U = self.diagonal, self.factor
         D_p, U_p = D[..., places], U[..., places, :]
+        certain = D_p + np.square(U_p).sum(axis=-1) <= self._rounding
+        D_p, U_p = np.where(certain, 0, D_p), np.where(certain[..., None], 0, U_p)
         inner = U_p @ U_p.swapaxes(-1, -2)
         np.einsum("...ii->...i", inner)[...] += D_p
         inverse = np.linalg.pinv(inner, hermitian=True)
@@ -115,6 +118,12 @@ class Covariance:
         remaining, D = U @ semidefinite_root(left), D.copy()
         D[..., places], remaining[..., places, :] = 0, 0
         return Covariance(D, remaining), gain
+
+    @property
+    def _rounding(self) -> np.ndarray:
+        """What a variance of 0 may become by rounding, (*batch, 1): in a factor that is the root of a covariance."""
+        variance = self.diagonal + np.square(self.factor).sum(axis=-1)
+        return self.size * np.finfo(np.float64).eps * variance.max(axis=-1, keepdims=True)
 
     def colour(self, eps: Array, more: Array) -> Array:
         """A draw of N(0, C) from two of unit noise (*batch, ..., d), numpy or torch; k entries of `more` count."""

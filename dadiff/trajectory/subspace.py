@@ -63,3 +63,24 @@ def semidefinite_inverse(M: np.ndarray) -> np.ndarray:
     scale = np.where(size > 0, size, 1.0)
     across = scale[..., :, None] * scale[..., None, :]
     return np.linalg.pinv(M / across, rcond=M.shape[-1] * np.finfo(np.float64).eps, hermitian=True) / across
+
+
+def regression(values: np.ndarray, regressors: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Least squares values = regressors coefficients + intercept + residual.
+
+    Entries that the regressors determine up to rounding, such as x(0) by E, have a residual of exactly 0: a deviation
+    that is rounding would be taken for one that can be learned from.
+
+    Args:
+        values: (N, d).
+        regressors: (N, c).
+
+    Returns:
+        coefficients (c, d), intercept (d,), residual (N, d).
+    """
+    design = np.concatenate([regressors, np.ones((len(regressors), 1))], axis=-1)
+    solution = np.linalg.lstsq(design, values, rcond=None)[0]
+    residual = values - design @ solution
+    size = np.abs(values).max(axis=0, initial=0)
+    residual[:, np.abs(residual).max(axis=0, initial=0) <= np.sqrt(np.finfo(np.float64).eps) * size] = 0
+    return solution[:-1], solution[-1], residual
