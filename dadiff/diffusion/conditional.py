@@ -43,7 +43,7 @@ class Conditional(Never):
 
     metric: Metric = "estimate"
     floor: float = 0.01
-    shrinkage: float = 0.3
+    shrinkage: float = 0.5
     directions: int = 0
     spread: bool = False
 
@@ -62,9 +62,9 @@ class Conditional(Never):
         """The corrected estimate, or a draw about it."""
         C = self.covariance(at)
         if not self.spread:
-            return at.project(tau0_hat, C)
+            return at.onto(tau0_hat, C)
         drawn = tau0_hat + like(C, tau0_hat).colour(at.noise(), at.noise())
-        return at.project(drawn, C, noise=at.noise())
+        return at.onto(drawn, C, at.noise())
 
     def covariance(self, at: Context) -> Covariance:
         """C at step i."""

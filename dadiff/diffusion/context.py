@@ -13,6 +13,8 @@ from dadiff.errors import NotApplicableError
 from dadiff.trajectory.arrays import Array
 from dadiff.trajectory.covariance import Covariance
 
+AT_ONCE = 8192  # cotangents of plans that a Jacobian is pulled back with at once
+
 Denoise = Callable[[Array, int, Array], Array]
 
 
@@ -123,6 +125,12 @@ class Context:
             )
         return self.estimate
 
+    def onto(self, tau: Array, metric: Covariance | None = None, noise: Array | None = None) -> Array:
+        """P of a clean estimate, begun at the last one, where P is iterated."""
+        projected = self.project(tau, metric, self.memory.get("projected"), noise)
+        self.memory["projected"] = projected
+        return projected
+
     def pull_back(self, cotangent: Array) -> Array:
         """J' v with J = d tau0_hat / d tau_i and v of the shape of tau: one more call, and one pass backwards.
 
@@ -137,7 +145,7 @@ class Context:
             return torch.autograd.grad(tau0_hat, tau, cotangent.clone())[0]
 
     def jacobian(self) -> Array:
-        """J of shape (..., d, d), plan by plan; one more call, and d passes backwards.
+        """J of shape (..., d, d), plan by plan; one more call, and passes backwards for d directions, many at once.
 
         Raises:
             NotApplicableError: if the denoiser cannot be differentiated.
@@ -146,6 +154,10 @@ class Context:
 
         with torch.inference_mode(False), torch.enable_grad():
             tau = self.tau.clone().requires_grad_()
-            entries = self.denoise.estimate(tau, self.step.i, self.environment.clone()).unbind(-1)
-            rows = [torch.autograd.grad(entry.sum(), tau, retain_graph=True)[0] for entry in entries]
+            tau0_hat = self.denoise.estimate(tau, self.step.i, self.environment.clone())
+            directions = torch.eye(tau.shape[-1], dtype=tau.dtype, device=tau.device)
+            rows = []
+            for some in directions.split(max(1, AT_ONCE // tau[..., 0].numel())):
+                v = some.reshape(len(some), *(1,) * (tau.ndim - 1), -1).expand(len(some), *tau.shape)
+                rows += torch.autograd.grad(tau0_hat, tau, v, retain_graph=True, is_grads_batched=True)[0].unbind()
         return torch.stack(rows, dim=-2)

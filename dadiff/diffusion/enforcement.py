@@ -123,7 +123,7 @@ class CleanEstimate(Never):
 
     def clean(self, tau0_hat: Array, at: Context) -> Array:
         """P(tau0_hat)."""
-        return at.project(tau0_hat)
+        return at.onto(tau0_hat)
 
 
 @dataclass(frozen=True)
