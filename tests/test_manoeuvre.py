@@ -110,3 +110,22 @@ def test_a_run_plans_for_nonlinear_robots(overrides, tmp_path):
     if "projector=none" not in overrides:
         assert metrics["gap"] < 1e-12
         assert metrics["initial_state_error"] < 1e-24
+
+
+def test_in_closed_loop_the_expert_plans_anew(task, rng):
+    robots = task.target(PlanarQuadrotors())
+    cases = task.cases(robots, 3, rng)
+    np.testing.assert_allclose(task.solve(robots, cases.environment), cases.reference, atol=1e-12)
+    goal = task.goal(robots, cases.environment)
+    np.testing.assert_array_equal(goal[..., :2], cases.get("target"))
+    np.testing.assert_array_equal(goal[..., 2:], 0)
+    Q, R = task.weights(robots)
+    np.testing.assert_array_equal(np.diag(Q), [1, 1, 0.1, 0.1, 0.1, 0.1])
+    np.testing.assert_array_equal(R, 0.05 * np.eye(2))
+
+
+def test_a_run_closes_the_loop(tmp_path):
+    overrides = ["evaluation=closed_loop", "evaluation.replan_every=[5]", "evaluation.steps=10"]
+    run = execute(Experiment.of(composed(*TINY, *overrides, f"output_dir={tmp_path}")))
+    assert run.record.metrics["closed_loop_optimal_5"] >= 0.9
+    assert np.isfinite(run.record.metrics["closed_loop_receding_5"])
