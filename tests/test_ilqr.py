@@ -102,7 +102,7 @@ def test_an_optimum_stays(rng):
     feasible = layout.flatten(system.simulate(starts(rng, 5), inputs := rng.standard_normal((5, HORIZON, 2))), inputs)
     problem = Tracking(system, metric(layout, rng, 2), feasible, layout.states(feasible)[:, 0])
     np.testing.assert_allclose(solve(problem).tau, feasible, atol=1e-12)
-    step = gauss_newton(problem, feasible, np.zeros(5), feasible=True)
+    step = gauss_newton(problem, feasible, np.zeros(5), problem.feasible(feasible))
     np.testing.assert_allclose(step.feedforward, 0, atol=1e-12)
 
 
@@ -147,3 +147,15 @@ def ipopt(casadi, robot, layout, W, reference, x_init):
     problem.minimize(delta.T @ W @ delta)
     problem.solver("ipopt", {"print_time": False}, {"print_level": 0, "sb": "yes", "tol": 1e-12})
     return float(problem.solve().value(delta.T @ W @ delta))
+
+
+def test_a_start_need_not_be_feasible(rng):
+    """It is made so by the first sweep, and leads where others do."""
+    system = PlanarQuadrotor()
+    layout = system.layout(HORIZON)
+    problem = Tracking(system, metric(layout, rng, 2), references(layout, rng, 5), starts(rng, 5))
+    rough = references(layout, rng, 5)
+    assert not problem.feasible(rough).any()
+    found = solve(problem, rough)
+    assert problem.feasible(found.tau).all()
+    np.testing.assert_allclose(found.cost, solve(problem).cost, rtol=1e-8)

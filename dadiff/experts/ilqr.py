@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from types import EllipsisType
 
 import numpy as np
 
@@ -25,7 +26,11 @@ from dadiff.trajectory.layout import TrajectoryLayout
 _BACKTRACKS = 8
 _DAMPING = 1e-4  # of a plan that no step length improved, in units of its input weight; tenfold at each failure
 _MOST_DAMPING = 1e8
+_ROUNDING = 1e-9
 _FLOOR = 1e-24  # costs below this share of |reference|^2 are rounding
+
+
+Index = np.ndarray | EllipsisType
 
 
 @dataclass(frozen=True)
@@ -128,8 +133,19 @@ class Tracking:
         where, values = self.pins
         return np.abs(tau[..., where] - values).sum(-1)
 
-    def take(self, index: np.ndarray) -> Tracking:
+    def feasible(self, tau: np.ndarray) -> np.ndarray:
+        """Which plans are trajectories of the system from x_init, up to rounding, (*robots, plans)."""
+        x, u = self.layout.split(tau)
+        following = self.system.step(x[..., :-1, :], u, np.arange(self.layout.horizon))
+        off = np.abs(x[..., 1:, :] - following).max(axis=(-2, -1))
+        if self.x_init is not None:
+            off = np.maximum(off, np.abs(x[..., 0, :] - self.x_init).max(axis=-1))
+        return off <= _ROUNDING * (1 + np.abs(tau).max(axis=-1))
+
+    def take(self, index: Index) -> Tracking:
         """The problems of plans `index`, where there is one system."""
+        if index is ...:
+            return self
         pins = self.pins and (self.pins[0], self.pins[1][index])
         x_init = None if self.x_init is None else self.x_init[index]
         return replace(self, reference=self.reference[index], x_init=x_init, pins=pins)
@@ -167,43 +183,80 @@ class Solution:
     converged: np.ndarray = field(repr=False)
 
 
+@dataclass
+class _Plans:
+    """Plans on their way; every array is (*robots, plans, ...)."""
+
+    tau: np.ndarray
+    feasible: np.ndarray
+    damping: np.ndarray
+    penalty: np.ndarray
+    count: np.ndarray
+    converged: np.ndarray
+
+    @classmethod
+    def of(cls, problem: Tracking, start: np.ndarray | None) -> _Plans:
+        tau = np.array(problem.reference if start is None else start)
+        shape = tau.shape[:-1]
+        feasible = np.zeros(shape, dtype=bool) if start is None else problem.feasible(tau)
+        return cls(tau, feasible, np.zeros(shape), np.zeros(shape), np.zeros(shape, int), np.zeros(shape, dtype=bool))
+
+    @property
+    def ended(self) -> np.ndarray:
+        """Which converged, or got stuck."""
+        return self.converged | (self.damping > _MOST_DAMPING)
+
+    def take(self, index: Index) -> _Plans:
+        """Those at `index`."""
+        return _Plans(*(values[index] for values in vars(self).values()))
+
+    def put(self, index: Index, plans: _Plans) -> None:
+        """The inverse of `take`."""
+        for values, some in zip(vars(self).values(), vars(plans).values(), strict=True):
+            values[index] = some
+
+
 def solve(
     problem: Tracking, start: np.ndarray | None = None, *, sweeps: int = 100, tolerance: float = 1e-12
 ) -> Solution:
     """Gauss-Newton sweeps until the cost of each plan falls by less than a share, or their number is reached.
 
     Args:
-        start: feasible plans to start from, (*robots, plans, d); None linearises along the reference itself first.
+        start: plans to start from, (*robots, plans, d); None stands for the reference. Where they are no trajectories
+            of the system the first sweep makes them so, whatever that costs; after it no sweep makes a plan worse.
         sweeps: at most.
         tolerance: the share.
     """
-    tau = problem.reference if start is None else start
-    feasible = start is not None
-    merit = problem.cost(tau) if feasible else np.full(tau.shape[:-1], np.inf)
-    damping, penalty = np.zeros(tau.shape[:-1]), np.zeros(tau.shape[:-1])
-    converged, count = np.zeros(tau.shape[:-1], dtype=bool), np.zeros(tau.shape[:-1], dtype=int)
+    plans = _Plans.of(problem, start)
     for _ in range(sweeps):
-        step = gauss_newton(problem, tau, damping, feasible=feasible)
-        penalty = np.maximum(penalty, 4 * np.abs(step.multipliers).max(axis=-1, initial=0.0))
-        before = merit + penalty * problem.violation(tau) if feasible else merit
-        tau, after, moved = _backtrack(problem, tau, step, before, penalty)
-        count += ~converged
-        converged |= moved & (before - after <= tolerance * after + problem.floor)
-        damping = np.where(moved, damping / 10 * (damping > _DAMPING), np.maximum(10 * damping, _DAMPING))
-        merit, feasible = problem.cost(tau), True
-        if (converged | (damping > _MOST_DAMPING)).all():
+        going: Index = ... if problem.system.robots else np.flatnonzero(~plans.ended)
+        plans.put(going, _sweep(problem.take(going), plans.take(going), tolerance))
+        if plans.ended.all():
             break
-    return Solution(tau, problem.cost(tau), count, converged)
+    return Solution(plans.tau, problem.cost(plans.tau), plans.count, plans.converged)
 
 
-def gauss_newton(problem: Tracking, tau: np.ndarray, damping: np.ndarray, *, feasible: bool) -> Step:
-    """The step from plans tau (*robots, plans, d), where they need not be feasible yet."""
+def _sweep(problem: Tracking, plans: _Plans, tolerance: float) -> _Plans:
+    """One sweep of some plans."""
+    tau, damping = plans.tau, plans.damping
+    step = gauss_newton(problem, tau, damping, plans.feasible)
+    penalty = np.maximum(plans.penalty, 4 * np.abs(step.multipliers).max(axis=-1, initial=0.0))
+    before = np.where(plans.feasible, problem.cost(tau) + penalty * problem.violation(tau), np.inf)
+    tau, after, moved = _backtrack(problem, tau, step, before, penalty)
+    converged = plans.converged | (moved & (before - after <= tolerance * after + problem.floor))
+    damping = np.where(moved, damping / 10 * (damping > _DAMPING), np.maximum(10 * damping, _DAMPING))
+    return _Plans(tau, plans.feasible | moved, damping, penalty, plans.count + ~plans.converged, converged)
+
+
+def gauss_newton(problem: Tracking, tau: np.ndarray, damping: np.ndarray, feasible: np.ndarray) -> Step:
+    """The step from plans tau (*robots, plans, d), of which not all need be feasible yet (*robots, plans)."""
     from dadiff.experts import riccati
 
     layout, metric = problem.layout, problem.metric
     x, u = layout.split(tau)
     A, B, c = problem.system.linearise(x[..., :-1, :], u, np.arange(layout.horizon))
-    defect = np.zeros_like(c) if feasible else c + _times(A, x[..., :-1, :]) + _times(B, u) - x[..., 1:, :]
+    defect = c + _times(A, x[..., :-1, :]) + _times(B, u) - x[..., 1:, :]
+    defect[feasible] = 0.0
     Lx, Lu = layout.split(metric.times(tau - problem.reference))
     columns, M, M0 = _parameters(problem, tau)
     shared_x, shared_u = (np.moveaxis(part, 0, -1) for part in layout.split(columns.T))
