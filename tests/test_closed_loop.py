@@ -14,12 +14,12 @@ from dadiff.diffusion.chain import Start
 from dadiff.diffusion.enforcement import CleanEstimate
 from dadiff.diffusion.samplers import DDIM
 from dadiff.diffusion.schedule import paper_linear
-from dadiff.errors import ConfigError
+from dadiff.errors import ConfigError, NotApplicableError
 from dadiff.evaluation import ClosedLoop
 from dadiff.evaluation.closed_loop import Bench, latencies, means
 from dadiff.planning import Planner
 from dadiff.randomness import numpy_generator
-from dadiff.systems import DampedIntegrators, double_integrator
+from dadiff.systems import DampedIntegrators, TimeVarying, double_integrator
 from dadiff.tasks import LQR, Fleet
 from dadiff.tasks.obstacles import Obstacles
 from dadiff.trajectory.coordinates import physical
@@ -94,6 +94,9 @@ def test_what_cannot_be_planned_for_again_is_refused():
     wrong = replace(PLANNER, task=Obstacles())
     with pytest.raises(ConfigError, match="closed_loop needs a task that steers to a goal"):
         Bench(wrong, CASES, ClosedLoop()).table()
+    A, B, c = SYSTEM.matrices(TASK.horizon)
+    with pytest.raises(NotApplicableError, match="each time from t = 0, but the system varies"):
+        Bench(replace(PLANNER, system=TimeVarying(A, B, c)), CASES, ClosedLoop()).table()
 
 
 BAD = [

@@ -15,10 +15,11 @@ import pandas as pd
 
 from dadiff.control import Controller, Episode, OpenLoop, RecedingHorizon, Tracking, run
 from dadiff.control.controllers import Trajectories, tracking_gains
-from dadiff.errors import ConfigError
+from dadiff.errors import ConfigError, NotApplicableError
 from dadiff.evaluation.settings import ClosedLoop, ControllerChoice
 from dadiff.planning import Planner, Plans
 from dadiff.randomness import numpy_generator
+from dadiff.systems import TimeVarying
 from dadiff.tasks.task import Cases, Steering
 
 TIMED_PLANS, TIMED_SECONDS = 100, 5.0  # plans of one case, one at a time, for the latency
@@ -40,11 +41,15 @@ class Bench:
 
     @property
     def task(self) -> Steering:
-        """Raises `ConfigError` unless it steers to a goal."""
+        """Raises `ConfigError` unless it steers to a goal, and plans made later are made for the same dynamics."""
         if not isinstance(self.planner.task, Steering):
             raise ConfigError(
                 "evaluation: closed_loop needs a task that steers to a goal at quadratic cost; use task=lqr or "
                 "task=fleet, or evaluation=default"
+            )
+        if isinstance(self.planner.system, TimeVarying):
+            raise NotApplicableError(
+                "evaluation: closed_loop plans each time from t = 0, but the system varies in time; use evaluation=default"
             )
         return self.planner.task
 
