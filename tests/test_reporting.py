@@ -21,7 +21,7 @@ from dadiff.errors import ConfigError, StoreError
 from dadiff.reporting import cli, configurations, labels, latex
 from dadiff.reporting.aggregation import Evidence, grid, pair, varying
 from dadiff.reporting.definitions import Item, for_sweep, load, names
-from dadiff.reporting.figures import paths
+from dadiff.reporting.figures import diffusion, paths
 from dadiff.reporting.figures.style import COLOURS, MARKERS, RC, looks_of, render
 from dadiff.reporting.render import to_json
 from dadiff.reporting.report import build
@@ -222,6 +222,16 @@ def test_paths_have_a_panel_a_condition_and_share_a_line_where_they_coincide(tmp
         "plans, with last-step noise": ["vanilla", "known FF† = Hankel HH†"],
         "plans, without last-step noise": ["vanilla", "known FF†", "Hankel HH†"],
     }
+
+
+def test_systems_without_a_plane_have_no_paths(tmp_path):
+    store = MadeUp(tmp_path, "lqr_made_up")
+    arrays = {name: values[..., :1] for name, values in example_arrays(10, 1.0).items() if values.ndim > 1}
+    store.run(1.0, projector="known", enforcement="normalised", denoiser="mlp", arrays=arrays)
+    store.sweep()
+    seen = Evidence(read_sweeps(tmp_path, [store.name]))
+    assert paths.collect(seen, cells={}).panels == []
+    assert diffusion.collect(seen, cells={}).stages == []
 
 
 def _labelled(content) -> list:

@@ -49,7 +49,7 @@ class Bench:
             )
         if isinstance(self.planner.system, TimeVarying):
             raise NotApplicableError(
-                "evaluation: closed_loop plans each time from t = 0, but the system varies in time; use evaluation=default"
+                "evaluation: closed_loop plans each time from t = 0, but the system varies; use evaluation=default"
             )
         return self.planner.task
 

@@ -58,8 +58,9 @@ def _draw_stage(ax: Axes, stage: Stage) -> None:
 
 
 def collect(evidence: Evidence, *, cells: Selector) -> Diffusion:
-    """The first finished cell whose chain was kept."""
-    kept = [c for m in evidence.methods(cells) for c in m.finished if "chain_states" in c.examples]
+    """The first finished cell whose chain was kept; none of systems that have no plane."""
+    finished = [c for m in evidence.methods(cells) for c in m.finished if "chain_states" in c.examples]
+    kept = [c for c in finished if c.examples["chain_states"].shape[-1] >= 2]
     if not kept:
         return Diffusion([], [], [])
     stored = kept[0].examples

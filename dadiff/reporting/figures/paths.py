@@ -6,6 +6,7 @@ Fig. 3 (a, b) of the paper; on the fleet a row a robot. The first two states are
 from __future__ import annotations
 
 import textwrap
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -134,7 +135,7 @@ def collect(
         apart: a panel a method, with the replay of its inputs, instead of one panel for all.
     """
     methods = evidence.methods(cells)
-    used = [m for m in methods if m.finished and "environment_target" in m.finished[0].examples]
+    used = [m for m in methods if m.finished and _in_a_plane(m.finished[0].examples)]
     values = list(dict.fromkeys(m.axes.get(by) for m in used)) if by else [None]
     shown, drawn = [name for name in varying(methods) if name != by], []
     rows: list[int] | list[None] = robots or [None]
@@ -157,6 +158,10 @@ def collect(
     across = min(len(used), 6 if robots else 4) if apart else min(max(len(values) + sample_of_data, 2), 3)
     notes = [f"{method_name(m.axes, varying(methods))}: {m.outcome}" for m in methods if m.lost]
     return Paths(drawn, across, [m.finished[0].key for m in used], notes)
+
+
+def _in_a_plane(stored: Mapping[str, np.ndarray]) -> bool:
+    return "environment_target" in stored and stored["states"].shape[-1] >= 2
 
 
 def _most_telling(method: Method, robot: int | None) -> int:
