@@ -18,6 +18,7 @@ import yaml
 from made_up import MadeUp, example_arrays
 
 from dadiff.errors import ConfigError, StoreError
+from dadiff.outside import without_passwords
 from dadiff.reporting import cli, configurations, labels, latex
 from dadiff.reporting.aggregation import Evidence, grid, pair, varying
 from dadiff.reporting.definitions import Item, for_sweep, load, names
@@ -26,7 +27,7 @@ from dadiff.reporting.figures.style import COLOURS, MARKERS, RC, looks_of, rende
 from dadiff.reporting.render import to_json
 from dadiff.reporting.report import build
 from dadiff.reporting.selection import matches
-from dadiff.reporting.sources import read_sweeps, without_password
+from dadiff.reporting.sources import read_sweeps
 from dadiff.reporting.statistics import ratio
 from dadiff.store import Results
 
@@ -117,9 +118,9 @@ def test_what_is_published_is_numbers_configurations_and_drawings(tmp_path):
 
 
 def test_a_password_in_an_address_is_not_shown():
-    shown = without_password("http://user:secret@host:5000/x")
-    assert shown == "http://host:5000/x"
-    assert without_password("sqlite:////a/b@c.db") == "sqlite:////a/b@c.db"
+    shown = without_passwords("http://user:secret@host:5000/x")
+    assert shown == "http://user@host:5000/x"
+    assert without_passwords("sqlite:////a/b@c.db") == "sqlite:////a/b@c.db"
 
 
 def test_the_page_asks_for_nothing_and_knows_no_place(report):
