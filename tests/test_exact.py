@@ -153,3 +153,11 @@ def test_the_law_of_the_task_serves_as_well():
     )  # fmt: skip
     cases = task.cases(system, 1, numpy_generator(0, "cases"))
     assert exactness(lqr, cases.environment).network_calls == 10
+
+
+def test_one_call_of_the_moment_matched_denoiser_is_linear_regression():
+    one = replace(planner(Never(), DDIM(1)), behaviour=None)
+    tau = one.plan(CASES.environment).tau[0, 0, 0]
+    design = np.concatenate([SHOWN.environment, np.ones((len(SHOWN.environment), 1))], axis=-1)
+    coefficients = np.linalg.lstsq(design, SHOWN.trajectories, rcond=None)[0]
+    np.testing.assert_allclose(tau, np.append(CASES.environment[0, 0], 1) @ coefficients, atol=1e-10)

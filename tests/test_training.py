@@ -14,7 +14,7 @@ from safetensors.torch import load_file
 
 from dadiff.denoisers import MLP, EncoderDecoder
 from dadiff.denoisers.checkpoints import load
-from dadiff.denoisers.learning import train
+from dadiff.denoisers.learning import Data, train
 from dadiff.denoisers.recipes import Recipe
 from dadiff.denoisers.training import Training
 from dadiff.diffusion.schedule import paper_linear
@@ -233,3 +233,15 @@ def test_learning_rate_schedules():
     assert rates[-1] < 1e-5
     constant = replace(training, learning_rate_schedule="constant")
     assert constant.learning_rate_at(99) == constant.learning_rate_at(999) == 1
+
+
+def test_a_regression_is_trained_at_the_last_step_alone(tmp_path):
+    """It predicts the mean of tau given E there, where tau_i is noise."""
+    training = replace(SHORT, steps=1500, batch_size=32, regression=True)
+    denoiser = run(tmp_path, training=training)
+    tau, E = (torch.from_numpy(values) for values in demonstrations())
+    noise = torch.randn(tau.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    error = (denoiser(noise, SCHEDULE.num_steps, E) - tau).square().mean()
+    assert float(error) < 0.05 * float(tau.square().mean())
+    data = Data(*demonstrations(), SCHEDULE.num_steps, training, "cpu", None)
+    assert (data.draw()[2] == SCHEDULE.num_steps).all()

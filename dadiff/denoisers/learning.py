@@ -137,14 +137,15 @@ class Data:
         self.trajectories = torch.from_numpy(trajectories).float()
         self.environment = torch.from_numpy(environment).float()
         self.num_steps, self.batch_size, self.device, self.augment = num_steps, training.batch_size, device, augment
+        self.first = num_steps if training.regression else 1
         self.generators = {role: torch_generator(training.seed, role) for role in ROLES}
 
     def draw(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """(tau0, E, i, eps) of one batch, i uniform on 1..L."""
+        """(tau0, E, i, eps) of one batch, i uniform on 1..L; of a regression L."""
         batches, noise, augmentation = self.generators.values()
         chosen = torch.randint(len(self.trajectories), (self.batch_size,), generator=batches)
         tau0, E = self.trajectories[chosen], self.environment[chosen]
-        i = torch.randint(1, self.num_steps + 1, (self.batch_size,), generator=noise)
+        i = torch.randint(self.first, self.num_steps + 1, (self.batch_size,), generator=noise)
         eps = torch.randn(tau0.shape, generator=noise)
         if self.augment is not None:
             E = self.augment(E, augmentation)

@@ -23,6 +23,8 @@ class Training:
         warmup: steps over which the learning rate rises linearly from 0.
         ema_decay: of the exponential running mean of the weights; 0 keeps the last weights.
         loss_weight: of the diffusion steps; `posterior_mean` is the paper's loss.
+        regression: train at the diffusion step L alone, where tau_i says next to nothing: plain regression of tau on E,
+            for `sampler=once`.
         checkpoint_every: steps between two checkpoints.
         seed: of the initial weights, batches and noise.
     """
@@ -34,6 +36,7 @@ class Training:
     warmup: int = 200
     ema_decay: float = 0.999
     loss_weight: LossWeight = "uniform"
+    regression: bool = False
     checkpoint_every: int = 1000
     seed: int = 0
 
