@@ -17,11 +17,15 @@ install: .venv/installed
 
 .venv/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
-	$(RUN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[test,lint,ipopt]'
+	$(RUN)/python tools/install.py .
 	@touch $@
 
-.venv/servers: .venv/installed
-	$(RUN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[slurm,ray,postgresql]'
+.venv/checks: .venv/installed
+	$(RUN)/python tools/install.py '.[test,lint,ipopt]'
+	@touch $@
+
+.venv/servers: .venv/checks
+	$(RUN)/python tools/install.py '.[slurm,ray,postgresql]'
 	@touch $@
 
 report: install
@@ -33,18 +37,18 @@ report: install
 	@echo "reports: $(OUTPUTS)/reports/lqr_quick/index.html  $(OUTPUTS)/reports/obstacles_quick/index.html"
 	@echo "runs:    $(RUN)/mlflow ui --backend-store-uri sqlite:///$(abspath $(OUTPUTS))/mlflow.db"
 
-test: install
+test: .venv/checks
 	OMP_NUM_THREADS=1 $(RUN)/pytest
 
 slow: .venv/servers
 	OMP_NUM_THREADS=1 $(RUN)/pytest -m slow
 
-lint: install
+lint: .venv/checks
 	$(RUN)/ruff check .
 	$(RUN)/ruff format --check .
 	$(RUN)/mypy
 
-bench: install
+bench: .venv/checks
 	$(RUN)/python -m bench
 
 clean:

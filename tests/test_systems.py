@@ -372,3 +372,15 @@ def test_recordings_under_feedback_cannot_identify(system):
     gain = np.ones((system.input_dim, system.state_dim))
     with pytest.raises(ExcitationError, match=rf"span {system.state_dim} dimensions, n \+ m = "):
         learned(Recording(x, x[:, :-1] @ gain.T))
+
+
+def test_forward_euler_is_python_controls():
+    import control
+
+    for axes in (1, 2, 3):
+        system = double_integrator(axes, time_step=0.3)
+        zero, one = np.zeros((axes, axes)), np.eye(axes)
+        continuous = control.ss(np.block([[zero, one], [zero, zero]]), np.vstack([zero, one]), np.eye(2 * axes), 0)
+        discrete = control.c2d(continuous, 0.3, method="euler")
+        np.testing.assert_array_equal(system.A, discrete.A)
+        np.testing.assert_array_equal(system.B, discrete.B)

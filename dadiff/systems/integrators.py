@@ -16,15 +16,17 @@ from dadiff.systems.system import Bounds, Limits
 def discretise(
     A: np.ndarray, B: np.ndarray, time_step: float, method: Literal["euler", "zoh"]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Discrete (A, B) of dx/dt = A x + B u by python-control: forward Euler or zero-order hold.
+    """Discrete (A, B) of dx/dt = A x + B u: forward Euler, or zero-order hold by python-control.
 
     Args:
         time_step: in seconds.
     """
-    import control
-
     if not time_step > 0:
         raise ConfigError(f"system: time_step is {time_step}; it must be positive (seconds)")
+    if method == "euler":
+        return np.eye(len(A)) + time_step * A, time_step * B
+    import control  # which takes longer to load than most cells to plan
+
     continuous = control.ss(A, B, np.eye(len(A)), np.zeros_like(B))
     discrete = control.c2d(continuous, time_step, method=method)
     return discrete.A, discrete.B
