@@ -1,5 +1,6 @@
 """Behaviours: the sets of admissible trajectories, what they are learned from, and the projections onto them."""
 
+from dadiff.behaviours.bounded import Bounded
 from dadiff.behaviours.components import (
     Hankel,
     HankelLowRank,
@@ -21,6 +22,7 @@ from dadiff.behaviours.sets import Dynamics, Everything, Rollout, Span, Trajecto
 from dadiff.behaviours.stages import Stages
 
 __all__ = [
+    "Bounded",
     "Dynamics",
     "Estimate",
     "Everything",

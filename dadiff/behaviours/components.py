@@ -12,6 +12,7 @@ from typing import ClassVar, Literal, Protocol, TypeVar
 
 import numpy as np
 
+from dadiff.behaviours.bounded import Bounded
 from dadiff.behaviours.least_squares import Offset, Transitions, least_squares, regressed
 from dadiff.behaviours.manifold import Manifold
 from dadiff.behaviours.pins import Pin
@@ -103,10 +104,12 @@ class Known:
     Args:
         initial_state: `fixed` projects onto the trajectories with x(0) = x_init.
         sweeps: for each projection onto nonlinear dynamics; more than one where a plan is projected once (post hoc).
+        bounded: keep to the system's bounds on states and inputs as well, where it has any.
     """
 
     initial_state: InitialState = "free"
     sweeps: int = 1
+    bounded: bool = False
     needs: ClassVar[frozenset[str]] = SYSTEM
 
     def __post_init__(self) -> None:
@@ -119,13 +122,23 @@ class Known:
         system: System | None = None,
         recording: Recording | None = None,
         demonstrations: np.ndarray | None = None,
-    ) -> Dynamics | Manifold:
-        """The trajectories of the system."""
+    ) -> Dynamics | Manifold | Bounded:
+        """The trajectories of the system.
+
+        Raises:
+            NotApplicableError: for bounds on a nonlinear system.
+        """
         system = _required(system, "known", "system")
         notes: dict[str, float] = {"rank": layout.rank}
+        bounded = self.bounded and system.bounds.any
         if not isinstance(system, AffineSystem):
+            if bounded:
+                raise NotApplicableError(
+                    "projector known: bounds are held for linear systems only; use projector.bounded=false"
+                )
             return Manifold(layout, system, self.sweeps, notes=notes)
-        return Dynamics(layout, stages_of(system, layout.horizon), notes=notes)
+        dynamics = Dynamics(layout, stages_of(system, layout.horizon), notes=notes)
+        return Bounded.by(dynamics, system.bounds) if bounded else dynamics
 
 
 @dataclass(frozen=True)

@@ -58,6 +58,10 @@ class Stages:
         """Leading dimensions."""
         return self.A.shape[:-3]
 
+    def take(self, index: np.ndarray) -> Stages:
+        """Of some robots."""
+        return Stages(self.A[index], self.B[index], self.c[index])
+
     def residual(self, layout: TrajectoryLayout, tau: Array) -> Array:
         """G tau - g of tau (*robots, plans, d): (*robots, T, plans, n)."""
         x, u = (contiguous(part.swapaxes(-2, -3)) for part in layout.split(tau))
@@ -121,15 +125,21 @@ class BlockTridiagonal:
     variance: np.ndarray = field(repr=False)
 
     @classmethod
-    def of(cls, stages: Stages, layout: TrajectoryLayout, weights: np.ndarray) -> BlockTridiagonal:
-        """Factorise with W = diag(weights (..., d)) and R = 0.
+    def of(
+        cls, stages: Stages, layout: TrajectoryLayout, weights: np.ndarray, noise: np.ndarray | float = 0.0
+    ) -> BlockTridiagonal:
+        """Factorise with W = diag(weights (..., d)) and R = noise I.
+
+        Args:
+            noise: a number, or one for each robot (*robots,).
 
         Raises:
             ConfigError: if the stages cannot all hold: too many entries have weight 0.
         """
         W_x, W_u = layout.split(np.broadcast_to(weights, (*stages.robots, layout.size)))
         added = (stages.B * W_u[..., None, :]) @ transposed(stages.B)
-        measured = W_x[..., None] * np.eye(layout.state_dim)
+        unit = np.eye(layout.state_dim)
+        added, measured = added + np.asarray(noise)[..., None, None, None] * unit, W_x[..., None] * unit
         P, inverse, variance = measured[..., 0, :, :], [], []
         over_time = (np.moveaxis(M, -3, 0) for M in (stages.A, added, measured[..., 1:, :, :]))
         for t, (A, Q, W) in enumerate(zip(*over_time, strict=True)):
