@@ -11,7 +11,8 @@ import pytest
 import yaml
 from laws import composed
 
-from dadiff.running.identity import digest, identify
+from dadiff.running.digest import digest
+from dadiff.running.identity import identify
 
 
 @cache

@@ -17,6 +17,7 @@ from typing import Any, get_type_hints
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
+from dadiff.config import own
 from dadiff.config.protocols import check_component
 from dadiff.errors import ConfigError
 
@@ -66,7 +67,7 @@ def _found(path: str, where: str, roots: frozenset[str]) -> Callable[..., Any]:
         )
     module, _, name = path.rpartition(".")
     try:
-        target = getattr(importlib.import_module(module), name)
+        target = getattr((own.load if own.is_own(path) else importlib.import_module)(module), name)
     except (ModuleNotFoundError, AttributeError) as error:
         raise ConfigError(f"{where}: {TARGET} {path} cannot be found ({error})") from error
     # What a trusted module has itself imported, such as pathlib.Path, is not the trusted package's.

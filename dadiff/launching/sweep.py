@@ -14,7 +14,7 @@ from dadiff.launching import jobs
 from dadiff.launching.outcome import Outcome
 from dadiff.launching.plan import Plan, PlannedCell, Preparation
 from dadiff.launching.work import Work
-from dadiff.running.identity import digest
+from dadiff.running.digest import digest
 from dadiff.store import DONE, Cell, Results, Sweep, Sweeps
 from dadiff.tracking import Tracking
 from dadiff.tracking.client import spared

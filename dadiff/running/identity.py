@@ -2,25 +2,29 @@
 
 The key is a hash of the complete configuration without what cannot matter: paths, tracking, device, verbosity; the
 recording where no projector reads it, the enforcement where nothing is projected, the training where nothing is
-trained. Data from files count by content, not by place. The same rule keys data sets, recordings and trainings, so
-that cells of a sweep share them. Free of torch.
+trained. Data from files count by content, not by place; own components with their sources. The same rule keys data
+sets, recordings and trainings, so that the runs of a sweep share them. Free of torch.
 """
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
+import numpy as np
+
 from dadiff.behaviours import NoProjector
 from dadiff.config import GROUPS
-from dadiff.config.build import TARGET, defaults, resolve
+from dadiff.config.build import TARGET
+from dadiff.config.own import is_own, sources_of
 from dadiff.datasets.files import FromFiles
 from dadiff.datasets.generated import PARTS, Dataset
+from dadiff.running import naming
+from dadiff.running.digest import digest
 from dadiff.running.parts import Parts
 from dadiff.tasks.encodings import Plain
+from dadiff.tasks.task import Versioned
 
 FORMAT = 2  # raised whenever a change moves results; see CHANGELOG
 
@@ -76,12 +80,6 @@ class Identity:
         return {artefact.kind: artefact.key for artefact in artefacts if artefact}
 
 
-def digest(value: Any) -> str:
-    """A stable hash of plain data: 16 hexadecimal digits."""
-    text = json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
-
-
 def identify(config: Mapping[str, Any]) -> Identity:
     """The identity of a resolved configuration, a nested plain mapping.
 
@@ -93,9 +91,10 @@ def identify(config: Mapping[str, Any]) -> Identity:
 
 def identity_of(parts: Parts) -> Identity:
     """The identity of a run with these components."""
-    nodes = {group: _content(getattr(parts, group), node) for group, node in parts.nodes.items()}
+    given = dict(parts.nodes) | {"recording": _with_noise(parts.nodes["recording"], parts)}
+    nodes = {group: _content(getattr(parts, group), node) for group, node in given.items()}
     matters = _groups_that_matter(parts)
-    coordinates = parts.settings.coordinates
+    seed, coordinates = parts.settings.seed, parts.settings.coordinates
     expert = {"format": FORMAT, "system": nodes["system"], "task": nodes["task"]}
     demonstrations = Artefact("demonstrations", expert | {"dataset": nodes["dataset"]["train"]})
     cases = Artefact("cases", expert | {"dataset": nodes["dataset"]["test"]})
@@ -103,12 +102,11 @@ def identity_of(parts: Parts) -> Identity:
     learning = [group for group in ("schedule", "encoding", "denoiser", "training") if group in matters]
     denoiser = Artefact("denoiser", trained | {g: nodes[g] for g in learning})
     recording = Artefact("recording", expert | {"recording": nodes["recording"]})
-    determined_by = {"format": FORMAT, "coordinates": coordinates, **{g: nodes[g] for g in matters}}
-    choices = {g: parts.settings.choices.get(g, nodes[g][TARGET].rpartition(".")[2].lower()) for g in matters}
+    shown = {group: given[group] for group in matters}
     return Identity(
-        determined_by,
-        _name(choices, nodes, parts),
-        _axes(choices, parts.nodes, parts),
+        {"format": FORMAT, "coordinates": coordinates, **{g: nodes[g] for g in matters}},
+        naming.name(shown, seed, coordinates),
+        naming.axes(shown, seed, coordinates),
         demonstrations,
         cases,
         denoiser if parts.denoiser.trainable else None,
@@ -129,39 +127,26 @@ def _groups_that_matter(parts: Parts) -> list[str]:
     return [group for group in GROUPS if group not in ignored]
 
 
-def _content(component: Any, node: Mapping[str, Any]) -> dict[str, Any]:
-    """The node; of data from files, what they hold in place of their path; of a data set, its two parts."""
-    if isinstance(component, Dataset):
-        return {TARGET: node[TARGET], **{part: component.determined_by(part) for part in PARTS}}
-    if isinstance(component, FromFiles):
-        return {**{k: v for k, v in node.items() if k != "path"}, "content": component.fingerprint()}
+def _with_noise(node: Mapping[str, Any], parts: Parts) -> dict[str, Any]:
+    """A recording that leaves its process noise to the system has that of the system."""
+    if "process_noise" in node and node["process_noise"] is None:
+        return {**node, "process_noise": np.asarray(parts.system.process_noise).tolist()}
     return dict(node)
 
 
-def _axes(choices: Mapping[str, str], nodes: Mapping[str, Mapping[str, Any]], parts: Parts) -> dict[str, Any]:
-    leaves = {f"{g}.{k}": v for g in choices for k, v in nodes[g].items() if k != TARGET}
-    initial_state = nodes["projector"].get("initial_state")
-    settings = {"seed": parts.settings.seed, "coordinates": parts.settings.coordinates, "initial_state": initial_state}
-    return {**choices, **settings, **leaves}
+def _content(component: Any, node: Mapping[str, Any]) -> dict[str, Any]:
+    """The node; of data from files, what they hold in place of their path; of a data set, its two parts.
 
-
-def _name(choices: Mapping[str, str], nodes: Mapping[str, Mapping[str, Any]], parts: Parts) -> str:
-    projector = _word("projector", choices, nodes)
-    fixed = nodes["projector"].get("initial_state") == "fixed" and not projector.endswith("_fixed")
-    words = [_word("task", choices, nodes), projector + ("_fixed" if fixed else "")]
-    if "recording" in choices and "length" in nodes["recording"]:
-        recording = nodes["recording"]
-        words += [f"S={recording['length']}", f"w={recording['process_noise']}"]
-        words += [f"recording={recording['seed']}"] if recording["seed"] != parts.settings.seed else []
-    others = ("enforcement", "encoding", "denoiser", "sampler")
-    words += [_word(group, choices, nodes) for group in others if group in choices]
-    return "/".join([*words, f"seed={parts.settings.seed}"])
-
-
-def _word(group: str, choices: Mapping[str, str], nodes: Mapping[str, Mapping[str, Any]]) -> str:
-    """The choice of a group, with the parameters that differ from their defaults: "ddpm(last_step_noise=False)"."""
-    usual = defaults(resolve(nodes[group], group, [nodes[group][TARGET].split(".")[0]]))
-    node = {name: list(value) if isinstance(value, tuple) else value for name, value in nodes[group].items()}
-    usual = {name: list(value) if isinstance(value, tuple) else value for name, value in usual.items()}
-    changed = [f"{k}={v}" for k, v in node.items() if k in usual and v != usual[k] and k != "initial_state"]
-    return choices[group] + (f"({','.join(changed)})" if changed else "")
+    Own components count with their sources, tasks with their version.
+    """
+    made: dict[str, Any] = {}
+    if is_own(node[TARGET]):
+        made["sources"] = sources_of(node[TARGET])
+    if isinstance(component, Versioned):
+        made["version"] = component.version
+    if isinstance(component, Dataset):
+        return {TARGET: node[TARGET], **{str(part): component.determined_by(part) | made for part in PARTS}}
+    if isinstance(component, FromFiles):
+        made["content"] = component.fingerprint()
+        node = {k: v for k, v in node.items() if k != "path"}
+    return {**node, **made}

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 
@@ -29,6 +30,8 @@ class Fleet(ManyRobots):
     Args:
         horizon, state_cost, input_cost, terminal_cost, init_range, target_range: as for `LQR`, the same for all robots.
     """
+
+    version: ClassVar[str] = "fleet-v1"
 
     horizon: int = 30
     state_cost: Weight = (10.0, 10.0, 1.0, 1.0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 
@@ -54,6 +54,8 @@ class LQR:
         reference: a test case's reference is the controller's trajectory without process noise (`mean`), or
             one noisy run of it (`realised`).
     """
+
+    version: ClassVar[str] = "lqr-v1"
 
     horizon: int = 30
     state_cost: Weight = (10.0, 10.0, 1.0, 1.0)

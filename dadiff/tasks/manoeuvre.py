@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -38,6 +39,8 @@ class Manoeuvre(ManyRobots):
         init_range: x_init ~ U[-a, a], (n,), in the units of the states.
         target_range: target ~ U[-b, b], (p,), p <= n, likewise.
     """
+
+    version: ClassVar[str] = "manoeuvre-v1"
 
     horizon: int = 40
     state_cost: Sequence[float] = (1.0, 1.0, 0.1, 0.1, 0.1, 0.1)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
 
@@ -56,6 +56,8 @@ class Obstacles:
         formulation: "constrained", or "literal" for the printed cost.
         expert: who solves the constrained problem.
     """
+
+    version: ClassVar[str] = "obstacles-v1"
 
     horizon: int = 40
     waypoint_times: Sequence[int] = (5, 33)

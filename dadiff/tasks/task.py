@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -188,3 +188,10 @@ class Augmenting(Protocol):
     def augment(self, environment: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
         """E (batch, c), changed at random."""
         ...
+
+
+@runtime_checkable
+class Versioned(Protocol):
+    """A task that says which of its definitions it is, so that results of an older one are not taken for its own."""
+
+    version: ClassVar[str]
