@@ -54,9 +54,19 @@ def check_what_is_printed(arguments: list[str]) -> None:
     assemble(configuration(given.overrides, given.config_dir))
 
 
+def overrides_first(arguments: list[str]) -> list[str]:
+    """The arguments with overrides before options, since Hydra takes only one group of overrides."""
+    flags = list(arguments)
+    overrides = get_args_parser().parse_intermixed_args(arguments).overrides
+    for override in overrides:
+        flags.remove(override)
+    return [*overrides, *flags]
+
+
 def main() -> None:
     """Entry point."""
     settle()
+    sys.argv[1:] = overrides_first(sys.argv[1:])
     trust(components_named(get_args_parser().parse_args(sys.argv[1:]).overrides))
     raise SystemExit(
         reported("dadiff", lambda: check_what_is_printed(sys.argv[1:])) or reported("dadiff", _application)

@@ -195,6 +195,11 @@ def test_a_key_misspelt_inside_a_preset_is_named_with_its_file(tmp_path):
         assemble(config)
 
 
+def test_a_misspelt_parameter_on_the_command_line_is_told_with_its_file():
+    told = refused(lambda: composed("projector.initial_sate=fixed"))
+    assert told == "projector (projector/known.yaml): key 'initial_sate' is not known; did you mean initial_state?"
+
+
 def test_a_configuration_is_resolved_once_in_a_trained_run(tmp_path, monkeypatch):
     small = [
         "dataset.train_size=20",

@@ -2,6 +2,7 @@
 
 import os
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -28,7 +29,7 @@ EXAMPLES = [block for block in blocks("python") if "class " not in block]
 
 
 def dadiff(arguments: list[str], folder: Path) -> subprocess.CompletedProcess:
-    environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(folder)}
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT), "PYTHONSAFEPATH": "1"}
     command = [sys.executable, "-m", "dadiff", *arguments]
     return subprocess.run(
         command, cwd=folder, env=environment, capture_output=True, text=True, timeout=250, check=False
@@ -49,16 +50,25 @@ def test_examples_run(example, tmp_path, monkeypatch):
     exec(compile(example, "README.md", "exec"), {})
 
 
-def test_the_projector_of_the_readme_is_one_class_and_one_yaml(tmp_path):
-    (tmp_path / "mylab").mkdir()
-    (tmp_path / "mylab/projectors.py").write_text(next(block for block in blocks("python") if "class Damped" in block))
-    (tmp_path / "myconf/projector").mkdir(parents=True)
-    (tmp_path / "myconf/projector/damped.yaml").write_text("_target_: mylab.projectors.Damped\n")
-    chosen = ["--config-dir", "myconf", "projector=damped", "denoiser=gaussian"]
-    done = dadiff([*chosen, "components=[mylab]", *SMALL], tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert "lqr/damped/normalised/gaussian" in done.stdout
-    refused = dadiff([*chosen, *SMALL], tmp_path)
+OWN = [shlex.split(line)[1:] for line in re.findall(r"`(dadiff [^`]*components=\[mylab\][^`]*)`", README)]
+
+
+def write_own_files(folder: Path) -> None:
+    """The README's own components, verbatim, where their first lines say."""
+    for block in [*blocks("python"), *blocks("yaml")]:
+        if path := re.match(r"# (my[\w/.]+)\n", block):
+            (folder / path[1]).parent.mkdir(parents=True, exist_ok=True)
+            (folder / path[1]).write_text(block)
+
+
+def test_own_components_run_as_written_from_an_empty_folder(tmp_path):
+    write_own_files(tmp_path)
+    assert len(OWN) == 2
+    for arguments in OWN:
+        done = dadiff([*arguments, "denoiser=gaussian", "tracking.enabled=false", *SMALL], tmp_path)
+        assert done.returncode == 0, done.stderr
+    assert "lqr/damped/normalised/gaussian" in done.stderr
+    refused = dadiff(["--config-dir", "myconf", "projector=damped"], tmp_path)
     assert refused.returncode == 1
     assert "components=[mylab]" in refused.stderr
 

@@ -118,7 +118,6 @@ def test_hydra_is_asked_to_do_nothing_but_compose(override):
     [
         ("projectr=known", "key 'projectr' is not known; did you mean projector?"),
         ("projector=knwn", "did you mean known?"),
-        ("projector.initial_sate=fixed", "did you mean projector.initial_state?"),
         ("+name=a=b", "quote what is special in it"),
         ("dry_run", "is no override; write group=choice or group.key=value"),
         ("sampler=[", "cannot be read as key=value"),

@@ -55,11 +55,13 @@ def resolve(node: Mapping[str, Any], where: str, trusted: Sequence[str] = ()) ->
     path = node.get(TARGET)
     if not isinstance(path, str) or "." not in path:
         raise ConfigError(f"{where}: {TARGET} is {path!r}; expected the dotted name of a class or function")
-    return _found(path, where, frozenset({"dadiff", *trusted}))
+    state = own.state_of(path) if path.split(".")[0] in trusted else None
+    return _found(path, where, frozenset({"dadiff", *trusted}), state)
 
 
 @cache
-def _found(path: str, where: str, roots: frozenset[str]) -> Callable[..., Any]:
+def _found(path: str, where: str, roots: frozenset[str], state: str | None) -> Callable[..., Any]:
+    """The target, looked up once as long as its sources stay as they are."""
     if path.split(".")[0] not in roots:
         raise ConfigError(
             f"{where}: {TARGET} {path} lies outside dadiff and is not built; "

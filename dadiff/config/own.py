@@ -51,12 +51,19 @@ def sources_of(target: str) -> str:
     Raises:
         ConfigError: if there are none, so that nobody could say what a result was made with.
     """
-    package = target.partition(".")[0]
-    _look_here()
-    found = _hash(package)
+    found = state_of(target)
     if found is None:
+        package = target.partition(".")[0]
         raise ConfigError(f"components: {package} has no source files; own components live in files of their own")
     return found
+
+
+def state_of(target: str) -> str | None:
+    """As `sources_of`; None for what has none, and for dadiff's own, which do not change while it runs."""
+    if not is_own(target):
+        return None
+    _look_here()
+    return _hash(target.partition(".")[0])
 
 
 def _hash(package: str) -> str | None:

@@ -37,7 +37,7 @@ class Settings:
         device: `auto` takes a GPU if there is one.
         output_dir: where everything is written.
         components: packages besides dadiff whose classes are named; trusted on the command line only.
-        force: run again what is finished.
+        force: make anew what is done: data, training and run.
         dry_run: say what would run, and stop.
         progress: show progress bars.
         choices: the preset chosen in each group, for names and messages; filled in by the command line.

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import wraps
 from pathlib import Path
@@ -28,6 +29,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from dadiff.config.composed import output_folder
+from dadiff.config.settings import GROUPS
 from dadiff.errors import ConfigError
 from dadiff.outside import check_aliases, text_of
 
@@ -57,6 +59,10 @@ MALFORMED = (
 """What Hydra raises when it composes from files and overrides that are none."""
 
 
+PARAMETER = re.compile(rf"({'|'.join(GROUPS)})\.[\w.]+=")
+"""A component's parameter, which its preset may leave to its default; which ones there are, its signature says."""
+
+
 class GuardedLoader(ConfigLoaderImpl):
     """Hydra's loader, which refuses what must not come from a file."""
 
@@ -74,8 +80,9 @@ class GuardedLoader(ConfigLoaderImpl):
             ConfigError: if the configuration asks Hydra to act, or is a sweep of too many cells.
         """
         arguments = (run_mode, from_shell, validate_sweep_overrides)
+        given = [f"++{text}" if PARAMETER.match(text) else text for text in overrides]
         try:
-            config = super().load_configuration(config_name, overrides, *arguments)
+            config = super().load_configuration(config_name, given, *arguments)
         except MALFORMED as error:
             raise ConfigError(self._told(error, config_name)) from error
         if "output_dir" in config:

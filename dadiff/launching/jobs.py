@@ -16,11 +16,11 @@ if TYPE_CHECKING:
 
 
 def run(config: Mapping[str, Any]) -> StoredRun:
-    """Run one resolved configuration; what is done already is read."""
+    """Run one resolved configuration of a sweep, which has made what its runs share; what is done already is read."""
     from dadiff.running.assembly import Experiment
     from dadiff.running.experiment import execute
 
-    return execute(Experiment.of(config))
+    return execute(Experiment.of(config, anew=()))
 
 
 def run_tracked(experiment: Experiment) -> StoredRun:
@@ -45,7 +45,7 @@ def build(config: Mapping[str, Any], kind: Shared) -> None:
     """Build what runs of a configuration share, unless it is cached."""
     from dadiff.running.assembly import Experiment
 
-    Experiment.of(config).build(kind)
+    Experiment.of(config, anew=(kind,)).build(kind)
 
 
 def record_end(identity: Identity, config: Mapping[str, Any], status: Status, reason: str) -> None:

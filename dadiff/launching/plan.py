@@ -10,10 +10,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from dadiff.running.identity import Artefact, Identity, identify
+from dadiff.running.identity import SHARED, Artefact, Identity, identify
 from dadiff.store import Cache, Cell, Results
-
-KINDS = ("demonstrations", "denoiser", "cases")
 
 
 @dataclass(frozen=True)
@@ -98,17 +96,21 @@ def _planned(config: dict[str, Any], identity: Identity, copies: int) -> Planned
 def _preparations(cells: Sequence[PlannedCell]) -> list[Preparation]:
     """What trainings need, trainings, test cases; each once, with the configuration of the first cell that needs it."""
     found: dict[str, Preparation] = {}
-    for position in range(len(KINDS)):
+    for position in range(len(SHARED)):
         for cell in cells:
             artefact = _artefacts(cell.identity)[position]
-            if artefact and not Cache(cell.config["output_dir"]).contains(artefact.kind, artefact.key):
+            if artefact and (cell.config.get("force") or not _is_cached(cell, artefact)):
                 before = {cell.identity.demonstrations.key} if artefact.kind == "denoiser" else set()
                 found.setdefault(artefact.key, Preparation(artefact, cell.config, frozenset(found) & before))
     return list(found.values())
 
 
+def _is_cached(cell: PlannedCell, artefact: Artefact) -> bool:
+    return Cache(cell.config["output_dir"]).contains(artefact.kind, artefact.key)
+
+
 def _artefacts(identity: Identity) -> tuple[Artefact | None, ...]:
-    """In the order of `KINDS`; an exact denoiser needs no demonstrations."""
+    """In the order of `SHARED`; an exact denoiser needs no demonstrations."""
     return (identity.demonstrations if identity.denoiser else None, identity.denoiser, identity.cases)
 
 

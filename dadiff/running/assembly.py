@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -16,7 +16,7 @@ from dadiff.denoisers.recipes import ExactRecipe, Recipe
 from dadiff.diffusion.estimate import Estimate
 from dadiff.errors import ConfigError
 from dadiff.experts.lqr import GaussianLaw
-from dadiff.running.identity import Artefact, Identity, Shared, identity_of
+from dadiff.running.identity import SHARED, Artefact, Identity, Shared, identity_of
 from dadiff.running.parts import Parts
 from dadiff.store import Cache, Results
 from dadiff.systems import Recording, Robots, System
@@ -38,6 +38,7 @@ class Experiment:
 
     Args:
         config: the resolved configuration that all of it was made from.
+        anew: what is made again though it is in the cache.
     """
 
     config: Mapping[str, Any]
@@ -45,17 +46,22 @@ class Experiment:
     identity: Identity
     cache: Cache
     results: Results
+    anew: Collection[Shared] = ()
 
     @classmethod
-    def of(cls, config: Mapping[str, Any]) -> Experiment:
+    def of(cls, config: Mapping[str, Any], anew: Collection[Shared] = SHARED) -> Experiment:
         """Assemble a resolved configuration.
+
+        Args:
+            anew: what `force` makes again besides the run: everything, where nobody else has done that.
 
         Raises:
             ConfigError: if it is not valid.
         """
         parts = Parts.of(config)
         output_dir = Path(parts.settings.output_dir).absolute()
-        return cls(config, parts, identity_of(parts), Cache(output_dir), Results(output_dir))
+        again = anew if parts.settings.force else ()
+        return cls(config, parts, identity_of(parts), Cache(output_dir), Results(output_dir), again)
 
     @property
     def output_dir(self) -> str:
@@ -233,7 +239,14 @@ class Experiment:
         return float(np.square(self.law.noise_map).sum(axis=(-2, -1)).mean())
 
     def _cached(self, artefact: Artefact, build: Callable[[Path], None], *, resumable: bool = False) -> Path:
-        return self.cache.get_or_build(artefact.kind, artefact.key, artefact.determined_by, build, resumable=resumable)
+        return self.cache.get_or_build(
+            artefact.kind,
+            artefact.key,
+            artefact.determined_by,
+            build,
+            resumable=resumable,
+            anew=artefact.kind in self.anew,
+        )
 
     def _trained(self, recipe: Recipe) -> NetworkDenoiser | EncodedDenoiser:
         from dadiff.denoisers.checkpoints import load

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -29,6 +29,8 @@ from dadiff.tasks.task import Versioned
 FORMAT = 2  # raised whenever a change moves results; see CHANGELOG
 
 Shared = Literal["demonstrations", "denoiser", "cases"]
+SHARED: tuple[Shared, ...] = get_args(Shared)
+"""What runs share, in the order in which it is made."""
 
 
 @dataclass(frozen=True)

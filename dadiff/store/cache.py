@@ -96,6 +96,7 @@ class Cache:
         build: Callable[[Path], None],
         *,
         resumable: bool = False,
+        anew: bool = False,
     ) -> Path:
         """The folder of an intact entry; built here if it is missing or damaged, by one process at a time.
 
@@ -103,14 +104,18 @@ class Cache:
             identity: everything that determines the content; kept in the manifest for people.
             build: writes the payload, and nothing else that should not stay, into the folder that it is given.
             resumable: hand `build` what a killed predecessor left in its folder, instead of an empty one.
+            anew: build it again in place of the one that is there.
 
         Raises:
             StoreError: if the cache cannot be written to or `build` wrote nothing.
         """
         folder = self.folder(kind, key)
-        if not self._is_intact(folder):
+        if anew or not self._is_intact(folder):
             store_id(self.root.parent)
             with locked(self._lock_file(kind, key), f"{kind} {key}"):
+                if anew and folder.is_dir():
+                    fresh_folder(folder).rmdir()
+                    self._verified.discard(folder)
                 if not self._is_intact(folder):
                     _set_aside(folder)
                     _build(folder, kind, key, identity, build, resumable)
