@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import csv
 import hashlib
+import itertools
 import json
 import shutil
 import subprocess
@@ -16,14 +17,15 @@ import numpy as np
 import pytest
 import yaml
 from made_up import MadeUp, example_arrays
+from matplotlib.markers import CARETDOWN
 
 from dadiff.errors import ConfigError, StoreError
 from dadiff.outside import without_passwords
 from dadiff.reporting import cli, configurations, labels, latex
 from dadiff.reporting.aggregation import Evidence, grid, pair, varying
-from dadiff.reporting.definitions import Item, for_sweep, load, names
+from dadiff.reporting.definitions import FOLDER, Item, for_sweep, load, names
 from dadiff.reporting.figures import diffusion, paths
-from dadiff.reporting.figures.style import COLOURS, MARKERS, RC, looks_of, render
+from dadiff.reporting.figures.style import COLOURS, INK, MARKERS, OTHER, RC, looks_of, render
 from dadiff.reporting.render import to_json
 from dadiff.reporting.report import build
 from dadiff.reporting.selection import matches
@@ -125,7 +127,11 @@ def test_a_password_in_an_address_is_not_shown():
 
 def test_the_page_asks_for_nothing_and_knows_no_place(report):
     page = (report / "index.html").read_text()
-    assert "<script" not in page
+    script = (FOLDER / "templates" / "report.js").read_text()
+    assert page.count("<script") == 1
+    assert script.strip() in page
+    assert len(script.splitlines()) <= 150
+    assert not any(text in script for text in ("fetch(", "XMLHttpRequest", "import ", "eval(", "innerHTML"))
     assert not any(text in page for text in ('src="http', "@import", "url(http", str(STORE), str(Path.home()) + "/"))
     assert page.count("<svg") > 5
 
@@ -154,7 +160,8 @@ def test_every_part_says_how_to_make_it_again_and_from_how_much(report):
     assert "interval" not in content["figures"]["theorem1"]["facts"]
     page = (report / "index.html").read_text()
     shown = [part for part in (*content["tables"].values(), *content["figures"].values()) if part["runs"]]
-    assert page.count("dadiff-report lqr_made_up --definition lqr") == len(shown)
+    assert len(shown) > 3
+    assert page.count("dadiff-report lqr_made_up --definition lqr") == 1
     assert f'href="#run-{content["figures"]["errors"]["runs"][0]}"' in page
 
 
@@ -175,8 +182,9 @@ def test_whatever_comes_from_a_store_is_escaped(tmp_path):
     store.sweep()
     assert cli.main(["lqr<b>", "--output-dir", str(tmp_path), "--definition", "default", "--out", str(tmp_path)]) == 0
     page = (tmp_path / "index.html").read_text()
-    assert "<script" not in page
+    assert page.count("<script") == 1
     assert "&lt;script&gt;" in page
+    assert not any(f"data-{name}={hostile}" in page for name in ("method", "choice"))
     tex = (tmp_path / "tables" / "summary.tex").read_text()
     assert r"\input" not in tex
     assert r"\textbackslash{}input\{x\} \$\textbackslash{}alpha\$ \& 5 \% \_\#" in tex
@@ -268,6 +276,100 @@ def test_projectors_look_the_same_everywhere_and_differ():
     alike = looks_of([{"projector": "known"}, {"projector": "known"}, {"projector": "none"}])
     assert alike[0].colour == alike[1].colour != alike[2].colour
     assert alike[0] != alike[1]
+
+
+@pytest.mark.parametrize("lines", [True, False])
+def test_no_two_methods_look_alike(lines):
+    """Variants of one look never meet the plain look of another, however many there are."""
+    choices = ((*COLOURS, "mine", "yours"), (None, "post_hoc", "convex", "clean_estimate"), ("free", "fixed"))
+    axes = [
+        dict(zip(("projector", "enforcement", "initial_state"), c, strict=True)) for c in itertools.product(*choices)
+    ]
+    looks = looks_of(axes, lines=lines)
+    assert len({(look.colour, look.marker, str(look.line), look.fill) for look in looks}) == len(axes)
+
+
+def linear(colour: str) -> np.ndarray:
+    parts = np.array([int(colour[k : k + 2], 16) for k in (1, 3, 5)]) / 255
+    return np.where(parts <= 0.04045, parts / 12.92, ((parts + 0.055) / 1.055) ** 2.4)
+
+
+def lab(rgb: np.ndarray) -> np.ndarray:
+    """CIE L*a*b* of linear sRGB, white D65."""
+    to_xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+    share = to_xyz @ np.clip(rgb, 0, 1) / to_xyz.sum(axis=1)
+    f = np.where(share > 0.008856, np.cbrt(share), 7.787 * share + 16 / 116)
+    return np.array([116 * f[1] - 16, 500 * (f[0] - f[1]), 200 * (f[1] - f[2])])
+
+
+SIGHT = {  # Machado, Oliveira & Fernandes (2009), at full severity
+    "usual": np.eye(3),
+    "deuteranopia": np.array([[0.3673, 0.8606, -0.2280], [0.2801, 0.6725, 0.0474], [-0.0118, 0.0429, 0.9689]]),
+    "protanopia": np.array([[0.1523, 1.0526, -0.2049], [0.1145, 0.7863, 0.0992], [-0.0039, -0.0481, 1.0520]]),
+}
+PAGES = {"light": ("#ffffff", "#1e1f21"), "dark": ("#16181b", "#e6e7e9")}
+"""Page and ink of the two schemes, as in the template."""
+
+
+@pytest.mark.parametrize("sight", SIGHT)
+@pytest.mark.parametrize("page", PAGES)
+def test_colours_are_told_apart(sight, page):
+    inks = [PAGES[page][1] if colour == INK else colour for colour in (*COLOURS.values(), OTHER[0])]
+    seen = [lab(SIGHT[sight] @ linear(colour)) for colour in inks]
+    apart = [np.linalg.norm(a - b) for k, a in enumerate(seen) for b in seen[:k]]
+    assert min(apart) > 20
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_colours_stand_out_from_the_page(page):
+    background = linear(PAGES[page][0]) @ [0.2126, 0.7152, 0.0722]
+    for colour in (*COLOURS.values(), OTHER[0]):
+        luminance = linear(PAGES[page][1] if colour == INK else colour) @ [0.2126, 0.7152, 0.0722]
+        light, dark = max(background, luminance), min(background, luminance)
+        assert (light + 0.05) / (dark + 0.05) >= 3, colour
+
+
+def test_rounding_leaves_the_limits_alone_and_is_drawn_at_the_edge(tmp_path):
+    store, shape = MadeUp(tmp_path), np.where(np.arange(11) == 0, 1e-30, 1.0)
+    store.run(1.0)
+    store.run(0.2, shape=shape, projector="known", enforcement="normalised")
+    store.sweep()
+    seen = Evidence(read_sweeps(tmp_path, [store.name]))
+    errors = build(load("default"), seen, [], "").figures[0].content
+    with matplotlib.rc_context(RC):
+        ax = errors.draw(2).axes[0]
+    assert ax.get_ylim()[0] > 1e-2
+    assert any(line.get_marker() == CARETDOWN and len(line.get_xdata()) == 1 for line in ax.lines)
+
+
+def test_curves_that_coincide_are_one_and_the_figure_says_what_it_found(tmp_path):
+    store = MadeUp(tmp_path)
+    store.run(1.0, spread=0)
+    for projector in ("known", "hankel"):
+        store.run(0.2, spread=0, projector=projector, enforcement="normalised")
+    store.sweep()
+    errors = build(load("default"), Evidence(read_sweeps(tmp_path, [store.name])), [], "").figures[0].content
+    assert [curve.label for curve in errors.panels[0].curves] == ["vanilla", "known FF† = Hankel HH†"]
+    assert errors.found == "Lowest state error: known FF† = Hankel HH†, 0.20 × vanilla"
+
+
+def test_axes_can_be_linear():
+    content = build(load("lqr"), evidence("lqr_made_up"), [], "").figures[0].content
+    assert render(content, 2, ("svg",), linear=True)["svg"] != render(content, 2, ("svg",))["svg"]
+
+
+def test_published_drawings_hold_no_names_that_are_meant_for_the_page(report):
+    for path in (report / "figures").glob("*.svg"):
+        assert b"method:" not in path.read_bytes()
+    assert 'data-method="vanilla"' in (report / "index.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("metric", "value", "words"),
+    [("cost_ratio", 1.25, "0.250"), ("gap", 1e-29, "exact"), ("collision_rollout", 0.0, "0"), ("gap", 0.5, "0.500")],
+)
+def test_columns_show_what_lies_above_the_floor(metric, value, words):
+    assert labels.column_value(metric, value, value, value) == words
 
 
 def test_phones_get_one_column():

@@ -67,10 +67,11 @@ def test_no_error_and_no_request_leaves_the_page(browser, page):
 def test_nothing_is_wider_than_the_page(browser, page, size):
     show(browser, page, size, "light")
     assert browser.execute_script("return document.documentElement.scrollWidth") <= size[0]
-    visible = "return [...document.querySelectorAll('svg')].filter(s => s.getClientRects().length).length"
-    assert browser.execute_script(visible) == browser.execute_script(
-        "return document.querySelectorAll('figure').length"
-    )
+    drawn = "return [...document.querySelectorAll('main > figure svg')].filter(s => s.getClientRects().length).length"
+    shown = "return document.querySelectorAll('main > figure').length"
+    assert browser.execute_script(drawn) == browser.execute_script(shown) > 0
+    height = browser.execute_script("return document.documentElement.scrollHeight")
+    assert height <= (6 if size == PAGE else 10) * size[1]
 
 
 def test_texts_of_figures_lie_inside_of_them(browser, page):
@@ -98,6 +99,58 @@ def test_both_schemes_are_readable(browser, page):
     for page_colour, ink in colours.values():
         assert contrast(page_colour, ink) > 7
     assert colours["light"] != colours["dark"]
+
+
+def test_a_legend_entry_hides_its_method_in_all_figures(browser, page):
+    show(browser, page, PAGE, "light")
+    hidden = "return document.querySelectorAll('[data-method].hidden').length"
+    click = "document.querySelector('[data-choice]').dispatchEvent(new MouseEvent('click', {bubbles: true}))"
+    assert browser.execute_script(hidden) == 0
+    browser.execute_script(click)
+    assert browser.execute_script(hidden) > 1
+    assert (
+        browser.execute_script("return document.querySelector('[data-choice]').getAttribute('aria-pressed')") == "false"
+    )
+    browser.execute_script(click)
+    assert browser.execute_script(hidden) == 0
+
+
+def test_tables_sort_and_filter_and_axes_change(browser, page):
+    show(browser, page, PAGE, "light")
+    sort = "document.querySelector('main > .scroll th:nth-child(2)').click()"
+    column = """return [...document.querySelectorAll('main > .scroll tbody tr')].map(r => value(r.cells[1]))
+                .filter(v => typeof v === 'number')"""
+    for ascending in (True, False):
+        browser.execute_script(sort)
+        values = browser.execute_script(column)
+        assert values == sorted(values, reverse=not ascending)
+    browser.execute_script(
+        """const box = document.querySelector('main > input'); box.value = 'vanilla';
+           box.dispatchEvent(new Event('input'))"""
+    )
+    rows = "[...document.querySelectorAll('main > .scroll tbody tr')]"
+    shown = f"return {rows}.filter(r => !r.hidden).map(r => r.textContent)"
+    assert all("vanilla" in text for text in browser.execute_script(shown))
+    if browser.execute_script("return document.querySelector('main > figure button') !== null"):
+        browser.execute_script("document.querySelector('main > figure button').click()")
+        assert (
+            browser.execute_script("return document.querySelector('.show-linear .linear').getClientRects().length") == 1
+        )
+
+
+def test_hovering_says_the_method_and_its_values(browser, page):
+    show(browser, page, PAGE, "light")
+    browser.execute_script(
+        """const svg = [...document.querySelectorAll('.drawing svg')].find(
+             s => s.getClientRects().length && s.querySelector('[data-values]'));
+           const group = svg.querySelector('[data-values]'), [[x, y]] = vertices(group)[0];
+           svg.scrollIntoView();
+           const at = new DOMPoint(x, y).matrixTransform(svg.getScreenCTM());
+           svg.dispatchEvent(new PointerEvent('pointermove', {clientX: at.x, clientY: at.y, bubbles: true}))"""
+    )
+    tip = browser.execute_script("return document.querySelector('.tip:not([hidden])')?.textContent")
+    assert tip
+    assert ": " in tip
 
 
 def contrast(first: str, second: str) -> float:

@@ -10,33 +10,25 @@ import dataclasses
 import json
 import re
 import shutil
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import jinja2
 import numpy as np
-from markupsafe import Markup, escape
 
 from dadiff.errors import StoreError
-from dadiff.reporting import configurations, labels, published
+from dadiff.reporting import configurations, published
 from dadiff.reporting.claims import read_ledger
 from dadiff.reporting.definitions import FOLDER
-from dadiff.reporting.figures.style import INK
-from dadiff.reporting.figures.style import render as render_figure
 from dadiff.reporting.latex import to_latex
+from dadiff.reporting.page import FORMS, draw, to_html, untagged
 from dadiff.reporting.report import Part, Report
-from dadiff.reporting.statistics import Estimate
 from dadiff.reporting.tables import to_csv
 from dadiff.store.files import make_folder, strict
 
 DIGITS = 6
 """Of numbers in report.json: the last ones differ between processors."""
 
-FORMS = {"tables": ("csv", "tex"), "figures": ("pdf", "svg", "png")}
 PUBLISHED = ("report.json", "configurations.yaml", "tables/*.csv", "figures/*.svg")
-WIDE, NARROW = 2, 1
-"""Columns of panels on a page or screen, and on a phone."""
 
 
 def render(report: Report, folder: Path) -> Path:
@@ -48,16 +40,17 @@ def render(report: Report, folder: Path) -> Path:
     for part in FORMS:
         make_folder(folder / part)
     older = _parts_in(folder)
-    drawings = {part.item.id: _draw(part) for part in report.figures if not part.empty}
+    drawings = {part.item.id: draw(part) for part in report.figures if not part.empty}
     try:
         _write_tables(report, folder / "tables")
         for name, drawing in drawings.items():
             for form, content in drawing.files.items():
-                shown = with_panel(content) if form == "svg" else content
-                (folder / "figures" / f"{name}.{form}").write_bytes(shown)
-        (folder / "report.json").write_text(to_json(numbers(report)), "utf-8")
+                whole = with_panel(untagged(content)) if form == "svg" else content
+                (folder / "figures" / f"{name}.{form}").write_bytes(whole)
+        shown = numbers(report)
+        (folder / "report.json").write_text(to_json(shown), "utf-8")
         (folder / "configurations.yaml").write_text(configurations.to_yaml(report.evidence.sweep), "utf-8")
-        (folder / "index.html").write_text(to_html(report, drawings), "utf-8")
+        (folder / "index.html").write_text(to_html(report, shown, drawings), "utf-8")
         _remove(folder, older - _parts_in(folder))
     except OSError as error:
         raise StoreError(f"{folder}: cannot be written ({error.strerror}); choose another --out") from None
@@ -98,25 +91,6 @@ def _parts_in(folder: Path) -> set[str]:
 def _remove(folder: Path, parts: set[str]) -> None:
     for part in parts:
         (folder / part).unlink(missing_ok=True)
-
-
-@dataclass(frozen=True)
-class Drawing:
-    """One figure as files, and as SVG for the inside of the page."""
-
-    files: dict[str, bytes]
-    inline: Markup
-
-
-def _draw(part: Part) -> Drawing:
-    files = render_figure(part.content, WIDE, FORMS["figures"])
-    title, name = part.item.title, part.item.id
-    wide = Markup(inline_svg(files["svg"], title, name))
-    phone = render_figure(part.content, NARROW, ("svg",))["svg"]
-    if phone == files["svg"]:
-        return Drawing(files, Markup('<div class="drawing">{}</div>').format(wide))
-    both = Markup('<div class="drawing wide">{}</div><div class="drawing narrow">{}</div>')
-    return Drawing(files, both.format(wide, Markup(inline_svg(phone, title, f"{name}-phone"))))
 
 
 def with_panel(svg: bytes) -> bytes:
@@ -169,7 +143,13 @@ def _rounded(value: Any) -> Any:
 
 
 def _part(part: Part) -> dict[str, Any]:
-    shown = {"title": part.item.title, "facts": part.facts, "notes": part.notes, "runs": part.runs}
+    shown = {
+        "title": part.item.title,
+        "found": getattr(part.content, "found", ""),
+        "facts": part.facts,
+        "notes": part.notes,
+        "runs": part.runs,
+    }
     return {**shown, "content": _plain(part.content)}
 
 
@@ -181,35 +161,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [_plain(part) for part in value]
     return value.tolist() if isinstance(value, np.ndarray) else value
-
-
-def to_html(report: Report, drawings: dict[str, Drawing]) -> str:
-    """The page: one file that asks for nothing else. Whatever comes from a store is escaped."""
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(FOLDER / "templates"),
-        autoescape=True,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        undefined=jinja2.StrictUndefined,
-    )
-    environment.filters |= {"metric": labels.metric_name, "estimate": _estimate}
-    page = environment.get_template("report.html")
-    return page.render(report=report, sweep=report.evidence.sweep, drawings=drawings)
-
-
-def _estimate(estimate: Estimate) -> str:
-    return labels.with_interval(estimate.value, estimate.low, estimate.high)
-
-
-def inline_svg(content: bytes, title: str, prefix: str) -> str:
-    """SVG for the inside of a page: ids of its own, the page's text colour, as wide as its place at most."""
-    svg = content.decode()
-    svg = re.sub(r"<metadata>.*?</metadata>", "", svg[svg.index("<svg") :], flags=re.DOTALL)
-    svg = re.sub(r'\bid="([^"]+)"', rf'id="{prefix}-\1"', svg)
-    svg = re.sub(r'(href="#|url\(#)', rf"\1{prefix}-", svg)
-    svg = svg.replace(INK, "currentColor")
-    head, body = svg.split(">", 1)
-    width = float(head.partition('width="')[2].partition("pt")[0]) * 4 / 3
-    head = re.sub(r' (width|height)="[\d.]+pt"', "", head)
-    look = f'role="img" aria-label="{escape(title)}" style="width:100%;max-width:{width:.0f}px;height:auto"'
-    return f"{head} {look}>{body}"

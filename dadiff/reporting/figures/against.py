@@ -5,15 +5,27 @@ With a baseline the line is the ratio of means to it, on the same cases and nois
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from dadiff.reporting.aggregation import Evidence, Method, has_metric, pair, varying
-from dadiff.reporting.figures.style import legend_below, letter, log_axis, look_of, looks_of, panels
-from dadiff.reporting.labels import FLOORS, axis_name, axis_value, method_name, metric_name
+from dadiff.reporting.figures.style import (
+    at_the_edge,
+    drawn,
+    legend_below,
+    letter,
+    log_axis,
+    look_of,
+    looks_of,
+    panels,
+    tag,
+)
+from dadiff.reporting.labels import FLOORS, ROUNDING, axis_name, axis_value, method_name, metric_name
 from dadiff.reporting.selection import Selector
 from dadiff.reporting.statistics import Estimate, mean, ratio
 
@@ -74,16 +86,22 @@ class Against:
 
 def _draw_panel(ax: Axes, panel: Panel) -> None:
     for line, look in zip(panel.lines, looks_of([line.axes for line in panel.lines]), strict=True):
-        y = [e.value for e in line.y]
+        exact = np.array([e.value for e in line.y])
+        y = drawn(exact)
         bars = [[e.value - e.low for e in line.y], [e.high - e.value for e in line.y]]
-        ax.errorbar(line.x, y, bars, fmt="none", color=look.colour, capsize=2, lw=1)
-        ax.plot(line.x, y, ls=look.line, lw=1.4, label=line.label, **look.points)
+        whiskers = ax.errorbar(line.x, y, bars, fmt="none", color=look.colour, capsize=2, lw=1)
+        (drawn_line,) = ax.plot(line.x, y, ls=look.line, lw=1.4, label=line.label, **look.points)
+        tag(line.label, drawn_line, values=True)
+        tag(line.label, *whiskers.get_children())
+        at_the_edge(ax, np.array(line.x), exact, look, line.label)
     for line in panel.levels:
         look, estimate = look_of(line.axes), line.y[0]
-        ax.axhline(estimate.value, color=look.colour, ls=(0, (2, 2)), lw=1.2, label=line.label)
-        ax.axhspan(estimate.low, estimate.high, color=look.colour, alpha=0.12, lw=0)
-    values = [e.value for line in (*panel.lines, *panel.levels) for e in line.y]
-    if values and min(values) > 0:
+        if estimate.value <= ROUNDING:
+            continue
+        level = ax.axhline(estimate.value, color=look.colour, ls=(0, (2, 2)), lw=1.2, label=line.label)
+        tag(line.label, level, ax.axhspan(estimate.low, estimate.high, color=look.colour, alpha=0.12, lw=0))
+    values = [e.value for line in (*panel.lines, *panel.levels) for e in line.y if not math.isnan(e.value)]
+    if values and min(values) >= 0:
         log_axis(ax, "y")
     log_axis(ax, "x")
 

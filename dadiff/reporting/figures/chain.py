@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from dadiff.reporting.aggregation import Evidence, varying
-from dadiff.reporting.figures.style import legend_below, letter, log_axis, looks_of, panels
+from dadiff.reporting.figures.style import legend_below, letter, log_axis, looks_of, panels, tag
 from dadiff.reporting.labels import method_name
 from dadiff.reporting.selection import Selector
 from dadiff.reporting.sources import Cell
@@ -45,7 +45,11 @@ class Chain:
         figure, axes = panels(len(PANELS), columns)
         for ax, (name, title) in zip(axes, PANELS.items(), strict=True):
             for trace, look in zip(self.traces, looks_of([trace.axes for trace in self.traces]), strict=True):
-                ax.plot(trace.steps, trace.values[name], color=look.colour, ls=look.line, lw=1.2, label=trace.label)
+                (line,) = ax.plot(
+                    trace.steps, trace.values[name], lw=1.2, ls=look.line, label=trace.label, markevery=0.12, ms=4,
+                    **look.points,
+                )  # fmt: skip
+                tag(trace.label, line, values=True)
             ax.set_xscale("symlog", linthresh=10)  # most happens in the last steps
             ax.set_xticks([0, 5, 10, 100, 1000], ["0", "5", "10", "100", "1000"])
             ax.set_xlim(max(trace.steps.max() for trace in self.traces), -0.5)

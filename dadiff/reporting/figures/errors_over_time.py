@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -10,8 +10,19 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from dadiff.reporting.aggregation import Evidence, Method, varying
-from dadiff.reporting.figures.style import legend_below, letter, log_axis, looks_of, panels
-from dadiff.reporting.labels import axis_value, method_name, metric_name
+from dadiff.reporting.figures.style import (
+    at_the_edge,
+    drawn,
+    headline,
+    label_ends,
+    legend_below,
+    letter,
+    log_axis,
+    looks_of,
+    panels,
+    tag,
+)
+from dadiff.reporting.labels import PROJECTORS, ROUNDING, axis_value, method_name, metric_name, number
 from dadiff.reporting.selection import Selector
 from dadiff.reporting.statistics import Band, band
 
@@ -47,26 +58,51 @@ class ErrorsOverTime:
         """One panel a metric, logarithmic, methods in the same order as in the legend."""
         figure, axes = panels(len(self.panels), columns)
         for ax, panel in zip(axes, self.panels, strict=True):
-            _draw_panel(ax, panel, self.marked)
+            _draw_panel(ax, panel, self.marked, labelled=columns > 1)
         letter(axes)
         legend_below(figure, axes)
+        headline(figure, self.found)
         return figure
 
+    @property
+    def found(self) -> str:
+        """Which method has the lowest error of the first panel, in the mean over time, and how it compares."""
+        means = {
+            curve.label: float(np.nanmean(curve.band.value)) for panel in self.panels[:1] for curve in panel.curves
+        }
+        vanilla = next((label for label in means if label.split(",")[0] == PROJECTORS["none"]), None)
+        if vanilla is None or len(means) < 2:
+            return ""
+        best, worst = min(means, key=means.__getitem__), max(means, key=means.__getitem__)
+        name, where = metric_name(self.panels[0].metric).split(" ‖")[0], self.panels[0].condition
+        told = f"Lowest {name}{f', {where},' if where else ''}: {best}"
+        told += f", {number(means[best] / means[vanilla], 2)} × {vanilla}" if best != vanilla else ""
+        return told + (f"; highest: {worst}, {number(means[worst] / means[vanilla], 2)} ×" if worst != vanilla else "")
 
-def _draw_panel(ax: Axes, panel: Panel, marked: list[int]) -> None:
+
+def _draw_panel(ax: Axes, panel: Panel, marked: list[int], *, labelled: bool) -> None:
+    ends = []
     for curve, look in zip(panel.curves, looks_of([curve.axes for curve in panel.curves]), strict=True):
         t = np.arange(len(curve.band.value))
-        shown = curve.band.value > 0  # False for nan, too: inputs have no entry at T
-        ax.fill_between(t[shown], curve.band.low[shown], curve.band.high[shown], color=look.colour, alpha=0.22, lw=0)
+        shown = ~np.isnan(drawn(curve.band.value))  # inputs have no entry at T
+        low, high = (drawn(bound)[shown] for bound in (curve.band.low, curve.band.high))
+        area = ax.fill_between(t[shown], low, high, color=look.colour, alpha=0.22, lw=0)
         every = max(1, len(t) // 6)
-        ax.plot(
+        (line,) = ax.plot(
             t[shown], curve.band.value[shown], ls=look.line, label=curve.label, markevery=every, ms=4, **look.points
         )
+        tag(curve.label, line, values=True)
+        tag(curve.label, area)
+        at_the_edge(ax, t, curve.band.value, look, curve.label)
+        ends += [(curve.label, curve.band.value[shown][-1], look.colour)] if shown.any() else []
     for t_marked in marked:
         ax.axvline(t_marked, color="#888888", lw=0.8, ls=":", zorder=0)
     log_axis(ax, "y")
+    if labelled:
+        label_ends(ax, ends)
     ax.set_title("\n".join(filter(None, (metric_name(panel.metric), panel.condition))))
     ax.set_xlabel("time t [steps]")
+    ax.set_ylabel("lower is better")
 
 
 def collect(
@@ -85,13 +121,29 @@ def collect(
     def panel(metric: str, value: Any) -> Panel:
         here = [method for method in alive if by is None or method.axes.get(by) == value]
         condition = axis_value(by, value) if by and len(values) > 1 else ""
-        return Panel(
-            metric, condition, [_curve(method, metric, [name for name in shown if name != by]) for method in here]
-        )
+        curves = [_curve(method, metric, [name for name in shown if name != by]) for method in here]
+        return Panel(metric, condition, _merged(curves))
 
     panels = [panel(metric, value) for value in values for metric in metrics]
     notes = [f"{method_name(method.axes, shown)}: {method.outcome}" for method in methods if method.lost]
     return ErrorsOverTime(panels if alive else [], marked or [], [key for m in alive for key in m.keys], notes)
+
+
+def _merged(curves: list[Curve]) -> list[Curve]:
+    """Curves that no eye can tell apart as one, named after all of them."""
+    distinct: list[Curve] = []
+    for curve in curves:
+        for index, other in enumerate(distinct):
+            if np.allclose(curve.band.value, other.band.value, rtol=COINCIDE, atol=ROUNDING, equal_nan=True):
+                distinct[index] = replace(other, label=f"{other.label} = {curve.label}")
+                break
+        else:
+            distinct.append(curve)
+    return distinct
+
+
+COINCIDE = 2e-3
+"""Relative difference below which curves are one."""
 
 
 def _curve(method: Method, metric: str, shown: list[str]) -> Curve:

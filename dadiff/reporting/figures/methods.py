@@ -13,8 +13,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from dadiff.reporting.aggregation import Evidence, Method, has_metric, varying
-from dadiff.reporting.figures.style import INK, letter, log_axis, look_of, panels
-from dadiff.reporting.labels import FLOORS, method_name, metric_name
+from dadiff.reporting.figures.style import INK, drawn, letter, log_axis, look_of, panels
+from dadiff.reporting.labels import FLOORS, ROUNDING, method_name, metric_name
 from dadiff.reporting.selection import Selector
 from dadiff.reporting.statistics import Estimate, mean
 
@@ -73,7 +73,11 @@ def _draw_rows(ax: Axes, rows: list[Row], *, log: bool) -> None:
             )
             continue
         offsets = y + 0.32 * (np.arange(len(row.dots)) / max(1, len(row.dots) - 1) - 0.5)
-        ax.plot(row.dots, offsets, ".", color=look.colour, alpha=0.6, ms=5.5, mew=0, rasterized=many)
+        shown = drawn(row.dots) if log else row.dots
+        ax.plot(shown, offsets, ".", color=look.colour, alpha=0.6, ms=5.5, mew=0, rasterized=many)
+        if log and row.estimate.value <= ROUNDING:
+            ax.annotate("exact", (0.02, y), xycoords=("axes fraction", "data"), va="center", fontsize=7.5)
+            continue
         bars = [[row.estimate.value - row.estimate.low], [row.estimate.high - row.estimate.value]]
         ax.errorbar(row.estimate.value, y, xerr=bars, fmt="none", color=look.colour, capsize=4, lw=1.6)
         edge = INK if look.fill == "full" else look.colour  # which makes it stand out from dots of its colour

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from dadiff.reporting.aggregation import Evidence, Method, varying
-from dadiff.reporting.figures.style import INK, legend_below, letter, look_of, panels
+from dadiff.reporting.figures.style import INK, legend_below, letter, look_of, panels, tag
 from dadiff.reporting.labels import axis_value, method_name
 from dadiff.reporting.selection import Selector
 from dadiff.tasks.environments import present
@@ -91,9 +91,10 @@ def _draw_panel(ax: Axes, panel: Panel) -> None:
         look = look_of(path.axes)
         width = max(3.2 - 0.7 * rank, 1.0) if len(panel.paths) > 1 else 1.5
         label = path.label if path.replayed is None else ""
-        ax.plot(*path.planned.T, color=look.colour, ls=look.line, lw=width, label=label)
+        (plan,) = ax.plot(*path.planned.T, color=look.colour, ls=look.line, lw=width, label=label)
+        tag(path.label, plan)
         if path.replayed is not None:
-            ax.plot(*path.replayed.T, color=look.colour, ls=REPLAY, lw=1.8)
+            tag(path.label, *ax.plot(*path.replayed.T, color=look.colour, ls=REPLAY, lw=1.8))
     ax.set_title("\n".join(textwrap.wrap(panel.title, 30)))
     ax.set_xlabel("x position")
     ax.set_ylabel("y position")

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from dadiff.reporting.aggregation import Evidence, Method, varying
-from dadiff.reporting.figures.style import legend_below, letter, log_axis, looks_of, panels
+from dadiff.reporting.figures.style import drawn, legend_below, letter, log_axis, looks_of, panels, tag
 from dadiff.reporting.labels import method_name, metric_name
 from dadiff.reporting.selection import Selector
 
@@ -38,7 +38,10 @@ class Robots:
         figure, axes = panels(len(self.metrics), columns)
         for index, (ax, metric) in enumerate(zip(axes, self.metrics, strict=True)):
             for points, look in zip(self.points, looks_of([p.axes for p in self.points], lines=False), strict=True):
-                ax.plot(points.distance, points.values[index], ls="", ms=3.5, label=points.label, **look.points)
+                (dots,) = ax.plot(
+                    points.distance, drawn(points.values[index]), ls="", ms=3.5, label=points.label, **look.points
+                )
+                tag(points.label, dots, values=True)
             log_axis(ax, "y")
             ax.set_title(metric_name(metric))
             ax.set_xlabel("distance from the training ranges, in their widths")

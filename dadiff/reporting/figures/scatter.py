@@ -8,8 +8,8 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from dadiff.reporting.aggregation import Evidence, Method, has_metric, varying
-from dadiff.reporting.figures.style import PANEL_WIDTH, legend_below, log_axis, looks_of, panels
-from dadiff.reporting.labels import FLOORS, method_name, metric_name
+from dadiff.reporting.figures.style import PANEL_WIDTH, legend_below, log_axis, looks_of, panels, tag
+from dadiff.reporting.labels import FLOORS, ROUNDING, method_name, metric_name
 from dadiff.reporting.selection import Selector
 from dadiff.reporting.statistics import Estimate, mean
 
@@ -41,8 +41,11 @@ class Scatter:
         figure, (ax,) = panels(1, columns, width=width, height=3.1 + 0.18 * len(self.points) / min(columns, 2))
         for point, look in zip(self.points, looks_of([point.axes for point in self.points], lines=False), strict=True):
             bars = [[[e.value - e.low], [e.high - e.value]] for e in (point.x, point.y)]
-            ax.errorbar(point.x.value, point.y.value, bars[1], bars[0], fmt="none", color=look.colour, capsize=2, lw=1)
-            ax.plot(point.x.value, point.y.value, ls="", ms=7, label=point.label, **look.points)
+            x, y = (max(e.value, ROUNDING) for e in (point.x, point.y))
+            whiskers = ax.errorbar(x, y, bars[1], bars[0], fmt="none", color=look.colour, capsize=2, lw=1)
+            (mark,) = ax.plot(x, y, ls="", ms=7, label=point.label, **look.points)
+            tag(point.label, mark, values=True)
+            tag(point.label, *whiskers.get_children())
         if self.diagonal:
             ends = [end([e.value for p in self.points for e in (p.x, p.y)]) for end in (min, max)]
             ax.plot(ends, ends, color="#888888", lw=0.8, ls=":", zorder=0)

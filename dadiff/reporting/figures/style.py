@@ -1,33 +1,42 @@
 """One look for all figures: the same colour and marker for the same projector everywhere.
 
-The colours are those of Okabe and Ito, told apart by colour-blind readers, and of middling brightness so that
-they stand out from a white page and from a dark one. `INK` is what text and axes are drawn with; the
-HTML puts the page's own text colour in its place.
+The colours are told apart by colour-blind readers (a CIE difference of 25 or more under deuteranopia and protanopia)
+and of middling brightness, so that they stand out from a white page and from a dark one, 3 : 1 or more. `INK` is what
+text, axes and vanilla diffusion are drawn with; the HTML puts the page's own text colour in its place.
+
+What is drawn of a method is tagged with its name, and its values where they are points, so that the page can hide it
+and say what it is.
 """
 
 from __future__ import annotations
 
 import io
+import itertools
 import math
-from collections.abc import Mapping, Sequence
+import textwrap
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol
 
 import matplotlib
+import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
+from matplotlib.lines import Line2D
+from matplotlib.markers import CARETDOWN
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator, ScalarFormatter
 
-from dadiff.reporting.labels import SUPERSCRIPT, number
+from dadiff.reporting.labels import ROUNDING, SUPERSCRIPT, number
 
 INK = "#2b2b2a"
 COLOURS = {
-    "none": "#888888",
-    "known": "#0080c8",
-    "hankel": "#dd5f00",
-    "hankel_lowrank": "#009e73",
-    "identified": "#cc6ba8",
-    "rollout": "#c99700",
+    "none": INK,
+    "known": "#4d4dff",
+    "hankel": "#e57300",
+    "hankel_lowrank": "#00a68a",
+    "identified": "#9785f2",
+    "rollout": "#99522e",
 }
 MARKERS = {"none": "o", "known": "s", "hankel": "^", "hankel_lowrank": "D", "identified": "v", "rollout": "P"}
 LINES = {
@@ -38,7 +47,8 @@ LINES = {
 }
 FILLS = ("full", "none")
 VARIANTS = (((0, (2, 1.5)), "left"), ((0, (6, 1.5)), "bottom"), ((0, (3, 1, 1, 1)), "right"), ((0, (1, 3)), "top"))
-OTHER = ("#5b5bd6", "X")
+OTHER = ("#2a6c8c", "X")
+SPARE = ("*", "h", "p", "<", ">", "8", "d", "H")
 PANEL_WIDTH, PANEL_HEIGHT = 3.7, 2.75
 CHARACTER = 0.072  # inches that a character of a legend takes, about
 LEGEND_LINE = 0.17  # inches of height that a line of a legend takes
@@ -66,6 +76,7 @@ RC: dict[Any, Any] = {
     "text.parse_math": False,
     "lines.linewidth": 1.6,
     "lines.markersize": 5.0,
+    "path.simplify": False,
 }
 
 
@@ -94,18 +105,83 @@ def look_of(axes: Mapping[str, Any]) -> Look:
 
 
 def looks_of(methods: Sequence[Mapping[str, Any]], *, lines: bool = True) -> list[Look]:
-    """As `look_of`; methods that would look alike get other lines and half filled markers, in their order.
+    """As `look_of`; methods that would look alike get other lines, half filled markers, then other markers.
 
     Args:
         lines: False where only markers are drawn, so that lines tell nothing apart.
     """
-    plain = [look_of(axes) if lines else replace(look_of(axes), line="-") for axes in methods]
     looks: list[Look] = []
-    for index, look in enumerate(plain):
-        variant = plain[:index].count(look)
-        line, fill = VARIANTS[(variant - 1) % len(VARIANTS)] if variant else (look.line, look.fill)
-        looks.append(replace(look, line=line, fill=fill))
+    for axes in methods:
+        plain = look_of(axes) if lines else replace(look_of(axes), line="-")
+        looks.append(next(look for look in _variants(plain, lines=lines) if look not in looks))
     return looks
+
+
+def _variants(plain: Look, *, lines: bool) -> Iterator[Look]:
+    """The look itself, then others of its colour, no two alike."""
+    if not lines:
+        yield from (replace(plain, marker=marker) for marker in (plain.marker, *SPARE))
+    for marker in (plain.marker, *SPARE):
+        yield replace(plain, marker=marker)
+        for line, fill in VARIANTS:
+            yield replace(plain, marker=marker, line=line if lines else plain.line, fill=fill)
+    yield from (replace(plain, marker=f"${number}$") for number in itertools.count(1))
+
+
+def tag(label: str, *artists: Artist, values: bool = False) -> None:
+    """Says whose artists these are; of a line, its points if they are to be read off."""
+    for artist in artists:
+        told = ""
+        if values and isinstance(artist, Line2D):
+            told = "|" + ";".join(f"{x:.4g},{y:.4g}" for x, y in np.asarray(artist.get_xydata()))
+        artist.set_gid(f"{TAG}{label.replace('|', '/')}{told}")
+
+
+TAG = "method:"
+
+
+def drawn(values: np.ndarray) -> np.ndarray:
+    """Values that a logarithmic axis can show; nan where they are 0, rounding or undefined."""
+    shown: np.ndarray = np.where(np.nan_to_num(values) > ROUNDING, values, np.nan)
+    return shown
+
+
+def at_the_edge(ax: Axes, x: np.ndarray, values: np.ndarray, look: Look, label: str) -> None:
+    """Values at rounding level as marks on the lower edge of an axis whose limits they leave alone."""
+    rounding = (values <= ROUNDING) & ~np.isnan(values)
+    if rounding.any():
+        low = np.zeros(int(rounding.sum()))
+        (marks,) = ax.plot(
+            x[rounding], low, ls="", marker=CARETDOWN, ms=5, color=look.colour, clip_on=False,
+            transform=ax.get_xaxis_transform(), scalex=False, scaley=False,
+        )  # fmt: skip
+        tag(label, marks)
+
+
+def label_ends(ax: Axes, ends: Sequence[tuple[str, float, str]]) -> None:
+    """Names at the right ends of curves: (label, y, colour), moved apart where they would overlap."""
+    if not 0 < len(ends) <= MOST_LABELS:
+        return
+    low, high = (math.log10(y) for y in ax.get_ylim())
+    ordered = sorted(ends, key=lambda end: end[1])
+    places = _apart([(math.log10(y) - low) / (high - low) for _, y, _ in ordered], LABEL_GAP)
+    look: dict[str, Any] = {"transform": ax.transAxes, "fontsize": 7, "va": "center", "clip_on": False}
+    for (label, _, colour), place in zip(ordered, places, strict=True):
+        tag(label, ax.text(1.015, place, "■", color=colour, **look), ax.text(1.055, place, label, **look))
+
+
+MOST_LABELS, LABEL_GAP = 6, 0.075
+
+
+def _apart(places: list[float], gap: float) -> list[float]:
+    """Ascending places at least a gap from one another, moved up and then, from the top, down."""
+    for index in range(1, len(places)):
+        places[index] = max(places[index], places[index - 1] + gap)
+    top = 1.0
+    for index in reversed(range(len(places))):
+        places[index] = min(places[index], top)
+        top = places[index] - gap
+    return places
 
 
 def panels(
@@ -133,12 +209,34 @@ def letter(axes: list[Axes]) -> None:
 def legend_below(figure: Figure, axes: list[Axes]) -> None:
     """One legend for all panels, under them, each label once, in as many columns as fit."""
     entries = {label: handle for ax in axes for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
+    tagged = {label for label, handle in entries.items() if _tagged(handle)}
     if entries:
         widest = CHARACTER * max(map(len, entries)) + 0.55
         columns = min(max(1, int(figure.get_figwidth() / widest)), len(entries))
         rows = -(-len(entries) // columns)
         figure.set_figheight(figure.get_figheight() + LEGEND_LINE * max(0, rows - 3))  # few fit into what is there
-        figure.legend(entries.values(), entries.keys(), loc="outside lower center", ncols=columns)
+        legend = figure.legend(entries.values(), entries.keys(), loc="outside lower center", ncols=columns)
+        for text, handle in zip(legend.get_texts(), legend.legend_handles, strict=True):
+            if handle is not None and text.get_text() in tagged:
+                tag(text.get_text(), handle)
+                text.set_gid(f"{CHOICE}{text.get_text()}")
+
+
+CHOICE = "choice:"
+"""A legend's entry, which the page makes a switch."""
+
+
+def _tagged(artist: Any) -> bool:
+    return isinstance(artist, Artist) and str(artist.get_gid() or "").startswith(TAG)
+
+
+def headline(figure: Figure, found: str) -> None:
+    """What a figure found, above it, wrapped to its width."""
+    if found:
+        width = int(figure.get_figwidth() / (1.15 * CHARACTER))
+        text = "\n".join(textwrap.wrap(found, width))
+        figure.set_figheight(figure.get_figheight() + LEGEND_LINE * (1 + text.count("\n")))
+        figure.suptitle(text, x=0.01, ha="left", fontsize=9.5, fontweight="bold")
 
 
 def log_axis(ax: Axes, which: Literal["x", "y"]) -> None:
@@ -190,11 +288,17 @@ METADATA: dict[str, dict[str, Any]] = {
 """None keeps dates and versions out."""
 
 
-def render(plotted: Drawable, columns: int, forms: Sequence[str]) -> dict[str, bytes]:
-    """The figure as pdf, svg or png; the same numbers give the same bytes. The layout is found once for all forms."""
+def render(plotted: Drawable, columns: int, forms: Sequence[str], *, linear: bool = False) -> dict[str, bytes]:
+    """The figure as pdf, svg or png; the same numbers give the same bytes. The layout is found once for all forms.
+
+    Args:
+        linear: with linear axes in place of logarithmic ones; nothing if there is none.
+    """
     rendered = {}
     with matplotlib.rc_context(RC):
         figure = plotted.draw(columns)
+        if linear and not _to_linear(figure):
+            return {}
         figure.draw_without_rendering()
         figure.set_layout_engine("none")
         for form in forms:
@@ -202,3 +306,15 @@ def render(plotted: Drawable, columns: int, forms: Sequence[str]) -> dict[str, b
             figure.savefig(buffer, format=form, dpi=160, transparent=form == "svg", metadata=METADATA[form])
             rendered[form] = buffer.getvalue()
     return rendered
+
+
+def _to_linear(figure: Figure) -> bool:
+    """Whether there was an axis to change."""
+    found = [ax for ax in figure.axes if ax.get_yscale() == "log"]
+    for ax in found:
+        ax.set_yscale("linear")
+        ax.yaxis.set_major_formatter(ScalarFormatter())
+        ax.relim()
+        ax.autoscale(axis="y")
+        ax.set_ylim(bottom=0)
+    return bool(found)
