@@ -245,3 +245,36 @@ def test_a_regression_is_trained_at_the_last_step_alone(tmp_path):
     assert float(error) < 0.05 * float(tau.square().mean())
     data = Data(*demonstrations(), SCHEDULE.num_steps, training, "cpu", None)
     assert (data.draw()[2] == SCHEDULE.num_steps).all()
+
+
+def test_rounded_products_in_training_resume_bit_for_bit_and_leave_float32(tmp_path):
+    training = replace(SHORT, precision="bfloat16")
+    run(tmp_path / "whole", training=training)
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path / "parts", training=training, augment=Interrupt(9))
+    run(tmp_path / "parts", training=training)
+    assert same_weights(tmp_path / "whole", tmp_path / "parts")
+    assert {weight.dtype for weight in load_file(tmp_path / "whole/model.safetensors").values()} == {torch.float32}
+    run(tmp_path / "float32")
+    assert not same_weights(tmp_path / "whole", tmp_path / "float32")
+
+
+def test_sampling_is_never_rounded(tmp_path):
+    """Estimates of a denoiser trained so are those of its stored weights, in float32."""
+    denoiser = run(tmp_path, training=replace(SHORT, precision="bfloat16"))
+    loaded = load(tmp_path / "model.safetensors", RECIPES[0], LAYOUT, CONDITION, SCHEDULE)
+    tau, E = (torch.from_numpy(values) for values in demonstrations(5))
+    assert torch.equal(loaded(tau, 3, E), denoiser(tau, 3, E))
+    assert denoiser.output(tau.float(), torch.tensor([3]), E.float()).dtype == torch.float32
+
+
+@pytest.mark.parametrize("recipe", RECIPES)
+def test_rounded_products_learn_as_well(recipe, tmp_path):
+    training = replace(SHORT, steps=300, batch_size=32)
+    tau, E = (torch.from_numpy(values) for values in demonstrations())
+    noise = torch.randn(tau.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    errors = {}
+    for precision in ("float32", "bfloat16"):
+        denoiser = run(tmp_path / precision, recipe, replace(training, precision=precision))
+        errors[precision] = float((denoiser(noise, SCHEDULE.num_steps, E) - tau).square().mean())
+    assert errors["bfloat16"] < 1.25 * errors["float32"]

@@ -110,13 +110,16 @@ class Objective:
         weight = loss_weights(training.loss_weight, schedule, table)
         columns = [np.sqrt(alpha_bar), np.sqrt(1 - alpha_bar), table.target_clean, table.target_noise, weight]
         self._columns = torch.from_numpy(np.stack(columns, axis=-1)).float().to(device)
+        self._device, self._rounded = torch.device(device).type, training.precision == "bfloat16"
 
     def __call__(self, denoiser: NetworkDenoiser, tau0: Tensor, E: Tensor, i: Tensor, eps: Tensor) -> Tensor:
         """Mean over a batch: tau0 and eps (B, d), E (B, c), i (B,)."""
         a, s, clean, noise, weight = self._columns[i, :, None].unbind(1)
         tau = a * tau0 + s * eps
         target = clean * tau0 + noise * eps
-        return (weight * (denoiser.output(tau, i, E) - target) ** 2).mean()
+        with torch.autocast(self._device, torch.bfloat16, enabled=self._rounded):
+            output = denoiser.output(tau, i, E)
+        return (weight * (output.float() - target) ** 2).mean()
 
 
 class Data:

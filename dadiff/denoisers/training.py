@@ -25,6 +25,8 @@ class Training:
         loss_weight: of the diffusion steps; `posterior_mean` is the paper's loss.
         regression: train at the diffusion step L alone, where tau_i says next to nothing: plain regression of tau on E,
             for `sampler=once`.
+        precision: of the network's products in training: `bfloat16` rounds them there (autocast), on processors with
+            such instructions 1.6 times faster. Weights, their running mean, the loss and all sampling stay float32.
         checkpoint_every: steps between two checkpoints.
         seed: of the initial weights, batches and noise.
     """
@@ -37,6 +39,7 @@ class Training:
     ema_decay: float = 0.999
     loss_weight: LossWeight = "uniform"
     regression: bool = False
+    precision: Literal["float32", "bfloat16"] = "float32"
     checkpoint_every: int = 1000
     seed: int = 0
 
