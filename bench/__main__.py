@@ -13,6 +13,7 @@ PARTS = {  # module: threads; the batched solver's many small operations are slo
     "bench.training": None,
     "bench.obstacles": 1,
     "bench.fleet": 1,
+    "bench.nonlinear": 1,
 }
 
 

@@ -1,0 +1,50 @@
+"""Independent solutions of the same problems, written out for IPOPT."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+
+from dadiff.systems.quadrotors import GRAVITY, PlanarQuadrotor
+from dadiff.trajectory import TrajectoryLayout
+
+
+def ipopt(
+    robot: PlanarQuadrotor, layout: TrajectoryLayout, W: np.ndarray, reference: np.ndarray, x_init: np.ndarray
+) -> tuple[float, float]:
+    """The least (tau - reference)' W (tau - reference) over the trajectories of one quadrotor from x_init.
+
+    Returns:
+        The cost, and the processor seconds of solving, without those of writing the problem out.
+    """
+    import casadi
+
+    problem, h = casadi.Opti(), robot.time_step
+    x, u = problem.variable(6, layout.horizon + 1), problem.variable(2, layout.horizon)
+
+    def rate(x: Any, u: Any) -> Any:
+        thrust = GRAVITY + robot.thrust_gain * u[0]
+        forward = -thrust * casadi.sin(x[2]) - robot.drag * x[3]
+        upward = thrust * casadi.cos(x[2]) - GRAVITY - robot.drag * x[4]
+        return casadi.vertcat(x[3], x[4], x[5], forward, upward, robot.torque_gain * u[1])
+
+    for t in range(layout.horizon):
+        k1 = rate(x[:, t], u[:, t])
+        k2 = rate(x[:, t] + h / 2 * k1, u[:, t])
+        k3 = rate(x[:, t] + h / 2 * k2, u[:, t])
+        k4 = rate(x[:, t] + h * k3, u[:, t])
+        problem.subject_to(x[:, t + 1] == x[:, t] + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4))
+    problem.subject_to(x[:, 0] == x_init)
+    states, inputs = layout.split(reference)
+    problem.set_initial(x, states.T)
+    problem.set_initial(u, inputs.T)
+    delta = casadi.vertcat(casadi.vec(x), casadi.vec(u)) - reference
+    problem.minimize(delta.T @ casadi.sparsify(casadi.DM(W)) @ delta)
+    options = {"print_time": False, "expand": True}
+    problem.solver("ipopt", options, {"print_level": 0, "sb": "yes", "tol": 1e-10})
+    problem.solve()  # sets up what is kept
+    begin = time.process_time()
+    solution = problem.solve()
+    return float(solution.value(problem.f)), time.process_time() - begin
