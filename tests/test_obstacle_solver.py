@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from dadiff.compiling import compiled
 from dadiff.errors import ConfigError
-from dadiff.experts.compiling import compiled
 from dadiff.experts.obstacles import batched, kernels
 from dadiff.experts.obstacles.problem import ObstacleProblem, time_step_of
 from dadiff.experts.obstacles.quadratic import obstacle_free

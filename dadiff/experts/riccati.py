@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dadiff.experts.compiling import compiled
+from dadiff.compiling import compiled
 
 Array = np.ndarray
 

@@ -58,18 +58,19 @@ class Continuous(System):
 
     def linearise(self, x: np.ndarray, u: np.ndarray, t: Times = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """By the chain rule through the integrator's stages, see `System.linearise`."""
-        n, m, h = self.state_dim, self.input_dim, self.time_step or 0.0
-        moved = np.broadcast_to(np.eye(n, n + m), (*x.shape[:-1], n, n + m))  # d(x, u)/d(x, u), rows of x
-        total, k, dk = moved.copy(), np.zeros_like(x), np.zeros(moved.shape)
-        following = x.copy()
-        for share, weight in STAGES[self.integrator]:
-            at = x + share * h * k
-            f_x, f_u = self.derivative_jacobian(at, u)
-            k, dk = self.derivative(at, u), f_x @ (moved + share * h * dk)
-            dk[..., n:] += f_u
-            following += weight * h * k
-            total += weight * h * dk
-        return affine(total[..., :n], total[..., n:], following, x, u)
+        from dadiff.systems.chain_rule import through_stages
+
+        n, m, h, lead = self.state_dim, self.input_dim, self.time_step or 0.0, x.shape[:-1]
+        shares, weights = h * np.array(STAGES[self.integrator]).T
+        f_x, f_u = np.empty((len(shares), *lead, n, n)), np.empty((len(shares), *lead, n, m))
+        k, following = np.zeros_like(x), x.copy()
+        for s, (share, weight) in enumerate(zip(shares, weights, strict=True)):
+            at = x + share * k
+            f_x[s], f_u[s] = self.derivative_jacobian(at, u)
+            k = self.derivative(at, u)
+            following += weight * k
+        A, B = through_stages(f_x.reshape(len(shares), -1, n, n), f_u.reshape(len(shares), -1, n, m), shares, weights)
+        return affine(A.reshape(*lead, n, n), B.reshape(*lead, n, m), following, x, u)
 
 
 def integrate(f: Function, x: Any, u: Any, h: float, integrator: Integrator) -> Any:

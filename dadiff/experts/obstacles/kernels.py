@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dadiff.experts.compiling import compiled
+from dadiff.compiling import compiled
 
 _PENALTY, _PENALTY_GROWTH, _ENOUGH_FALL = 3.0, 10.0, 0.25
 _SETTLED = 1e-10  # Newton decrement, in units of cost, at which multipliers move on
