@@ -29,11 +29,11 @@ def one_run(config: dict[str, Any]) -> None:
         print(f"{experiment.identity.key}  {experiment.identity.name}")
         return
     from dadiff.launching.jobs import run_tracked
-    from dadiff.running.summary import summary
+    from dadiff.running import summary
 
     before = experiment.is_done
     stored = run_tracked(experiment)
-    print(summary([stored]))
+    print(summary.one_run(stored))
     print(f"stored {'before, nothing was run: ' if before else 'in '}{stored.folder}")
 
 

@@ -60,9 +60,9 @@ def loaded(done: subprocess.CompletedProcess[str]) -> set[str]:
 def test_a_run_prints_its_table_and_stores_its_result(dadiff, tmp_path):
     done = dadiff(*TINY, "projector=rollout")
     assert done.returncode == 0, done.stderr
-    header, row, where = done.stdout.splitlines()
-    assert header.split()[0] == "run"
-    assert row.startswith("lqr/rollout/normalised/gaussian/")
+    name, *metrics, where = done.stdout.splitlines()
+    assert name.startswith("lqr/rollout/")
+    assert [line.rsplit(maxsplit=1)[0].strip() for line in metrics][:2] == ["state error", "input error"]
     folder = Path(where.removeprefix("stored in "))
     assert folder.parent == tmp_path / "outputs" / "runs"
     assert json.loads((folder / "run.json").read_text())["status"] == "finished"

@@ -122,6 +122,13 @@ def test_learned_sets_are_measured_against_the_true_one(run):
     assert "principal_angle" not in run("known").metrics
 
 
+def test_the_recorder_of_theorem_1_can_be_switched_off_and_changes_nothing_else(run):
+    followed, plain = run("known"), run("known", "evaluation.theorem1=false")
+    assert followed.has("chain")
+    assert not plain.has("chain")
+    pd.testing.assert_frame_equal(per_step(followed), per_step(plain), check_exact=True)
+
+
 def test_a_diverged_run_is_a_result_without_numbers(run):
     stored = run("known", "evaluation.divergence_bound=100.0", "sampler.num_steps=1000", enforcement="literal")
     assert stored.status == "diverged"

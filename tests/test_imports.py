@@ -14,7 +14,7 @@ import pytest
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "dadiff"
 HEAVY = {"torch", "mlflow", "control", "cvxpy", "casadi", "matplotlib", "numba"}
-OPEN = {"errors", "randomness", "folders", "threads", "outside", "memory", "commands", "compiling"}
+OPEN = {"terminal", "errors", "randomness", "folders", "threads", "outside", "memory", "commands", "compiling"}
 
 
 def room_of(file: Path) -> str:

@@ -22,12 +22,15 @@ class Evaluation:
         divergence_bound: a chain is stopped as diverged once a value exceeds it, in the sampler's coordinates.
         examples: number of cases whose plans are stored for figures.
         seed: of the initial and step noise, which is the same for every projector.
+        theorem1: follow the distance of Theorem 1 along the chain, where the law of demonstrations is known. It takes a
+            singular value decomposition of the size of tau, which for large systems takes longer than all else.
     """
 
     samples: int = 10
     divergence_bound: float = 1e6
     examples: int = 4
     seed: int = 0
+    theorem1: bool = True
 
     def __post_init__(self) -> None:
         if self.samples < 1 or self.examples < 0 or not self.divergence_bound > 0:

@@ -27,6 +27,7 @@ from dadiff.launching.pool import Pool
 from dadiff.launching.sweep import SweepRun, summary
 from dadiff.launching.table import Table
 from dadiff.launching.work import Running, Work
+from dadiff.running.summary import several_runs
 from dadiff.store import DONE, Lease, Sweeps
 
 
@@ -88,6 +89,7 @@ class SweepLauncher(Launcher):
             interrupted = True
         watch.close()
         sweep = run.close(watch.outcomes, interrupted=interrupted)
+        sys.stdout.write(f"{several_runs(run.stored(sweep))}\n")
         sys.stderr.write(f"{summary(sweep, skipped, run.folder)}\n{run.tracking.how_to_look(run.name)}\n")
         return 130 if interrupted else int(any(cell.status not in DONE for cell in sweep.cells))
 

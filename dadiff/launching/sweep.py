@@ -5,6 +5,7 @@ plan -> MLflow's store -> sweep.json and its mirror -> jobs, each mirrored as it
 
 from __future__ import annotations
 
+import shlex
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,7 +16,7 @@ from dadiff.launching.outcome import Outcome
 from dadiff.launching.plan import Plan, PlannedCell, Preparation
 from dadiff.launching.work import Work
 from dadiff.running.digest import digest
-from dadiff.store import DONE, Cell, Results, Sweep, Sweeps
+from dadiff.store import DONE, Cell, Results, StoredRun, Sweep, Sweeps
 from dadiff.tracking import Tracking
 from dadiff.tracking.client import spared
 from dadiff.tracking.content import results_table
@@ -83,10 +84,15 @@ class SweepRun:
         sweep = self.record(self.cells(outcomes, "interrupted" if interrupted else "waiting"))
         sweeps.write(sweep)
         results_table(sweep, results).to_csv(sweeps.folder(self.name) / "results.csv", index=False)
-        stored = [results.read(cell.key) for cell in sweep.cells if results.status(cell.key) is not None]
+        stored = self.stored(sweep)
         with spared(self.name):
             self.tracking.catch_up(self.output_dir, stored, [self.name])
         return sweep
+
+    def stored(self, sweep: Sweep) -> list[StoredRun]:
+        """What lies on disk of a sweep's cells, failed ones among them."""
+        results = Results(self.output_dir)
+        return [results.read(cell.key) for cell in sweep.cells if results.status(cell.key) is not None]
 
     def record(self, cells: Sequence[Cell]) -> Sweep:
         """The sweep as stored."""
@@ -127,4 +133,6 @@ def summary(sweep: Sweep, skipped: int, folder: Path) -> str:
     lines += [f"  {cell.status}: {cell.name}: {cell.reason}" for cell in sweep.cells if cell.reason]
     if any(cell.status not in DONE for cell in sweep.cells):
         lines.append(f"the same command resumes it, leaving alone what is done: {sweep.command}")
-    return "\n".join([*lines, f"record and logs: {folder}"])
+    output_dir = folder.parent.parent
+    where = "" if output_dir == Path("outputs").absolute() else f" --output-dir {shlex.quote(str(output_dir))}"
+    return "\n".join([*lines, f"record and logs: {folder}", f"report: dadiff-report {shlex.quote(sweep.name)}{where}"])

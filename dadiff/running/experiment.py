@@ -125,10 +125,10 @@ def measured_projection(experiment: Experiment, environment: np.ndarray) -> tupl
 
 
 def _observers(experiment: Experiment, environment: np.ndarray) -> tuple[ChainRecorder | None, Snapshots]:
-    """The recorder of Theorem 1, where the law is known and there is one system; and snapshots of the first plan."""
+    """The recorder of Theorem 1, if it is wanted, for one system of a known law; and snapshots of the first plan."""
     parts = experiment.parts
     snapshots = Snapshots(parts.schedule.alpha_bar, (0,) * (environment.ndim - 1))
-    if parts.denoiser.trainable or environment.ndim > 2:
+    if parts.denoiser.trainable or environment.ndim > 2 or not parts.evaluation.theorem1:
         return None, snapshots
     followed = np.arange(0, len(environment), parts.evaluation.samples)
     distance = MahalanobisDistance.of(experiment.law, environment[followed])

@@ -1,12 +1,16 @@
-"""A short table of runs for the terminal."""
+"""Runs for the terminal: one as a short vertical list, several as a table, best first and as wide as the terminal."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
-from dadiff.store import StoredRun
+from rich.table import Table
 
-COLUMNS = {
+from dadiff.store import StoredRun
+from dadiff.terminal import plain_table, text
+
+METRICS = {
     "state error": "planned_state_error",
     "input error": "planned_input_error",
     "replayed": "rollout_state_error",
@@ -17,20 +21,56 @@ COLUMNS = {
     "calls": "network_calls",
     "seconds": "sampling_seconds",
 }
+COLUMNS = ("cost ratio", "state error", "replayed", "plan-replay gap", "seconds")
+"""Of several runs, which are sorted by the first of these that they have."""
+MOST_ROWS = 30
 
 
-def summary(runs: Sequence[StoredRun]) -> str:
-    """One line a run: means over cases, samples and time. A run without numbers says why."""
-    width = max(len(run.name) for run in runs)
-    lines = [f"{'run':<{width}}" + "".join(f"{title:>17}" for title in COLUMNS)]
-    return "\n".join(lines + [_line(run, width) for run in runs])
-
-
-def _line(run: StoredRun, width: int) -> str:
+def one_run(run: StoredRun) -> str:
+    """Its name, and means over cases, samples and time; a run without numbers says why."""
     if run.status != "finished":
-        return f"{run.name:<{width}}  {run.status}: {run.record.reason or ''}"
-    return f"{run.name:<{width}}" + "".join(f"{_number(run.metrics.get(name)):>17}" for name in COLUMNS.values())
+        return f"{run.name}\n  {run.status}: {run.record.reason or ''}"
+    table = Table.grid(padding=(0, 2))
+    for title, metric in METRICS.items():
+        if metric in run.metrics:
+            table.add_row(f"  {title}", _number(run.metrics[metric]))
+    return f"{run.name}\n{text(table)}"
+
+
+def several_runs(runs: Sequence[StoredRun]) -> str:
+    """One row a run, called by what is not the same in all of them; runs without numbers come last."""
+    if not runs:
+        return ""
+    titles = [title for title in COLUMNS if any(METRICS[title] in run.metrics for run in runs)]
+    table = plain_table("run", *titles)
+    for column in table.columns[1:]:
+        column.justify = "right"
+    names = differences([run.name for run in runs])
+    ranked = sorted(zip(runs, names, strict=True), key=lambda entry: _rank(entry[0]))
+    for run, name in ranked[:MOST_ROWS]:
+        numbers = [_number(run.metrics.get(METRICS[title])) for title in titles]
+        table.add_row(name, *(numbers if run.status == "finished" else [run.status][: len(titles)]))
+    more = len(ranked) - MOST_ROWS
+    return text(table) + (f"\n... and {more} more" if more > 0 else "")
+
+
+def differences(names: Sequence[str]) -> list[str]:
+    """Each name without the words that all of them have.
+
+    Example:
+        >>> differences(["lqr/known/mlp/seed=0", "lqr/none/mlp/seed=0"])
+        ['known', 'none']
+    """
+    words = [name.split("/") for name in names]
+    common = set.intersection(*map(set, words))
+    return ["/".join(word for word in name if word not in common) or "/".join(name) for name in words]
+
+
+def _rank(run: StoredRun) -> tuple[bool, float]:
+    values = (run.metrics.get(METRICS[title]) for title in COLUMNS)
+    value = next((value for value in values if value is not None and math.isfinite(value)), math.inf)
+    return run.status != "finished", value
 
 
 def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.4g}"
+    return "-" if value is None or math.isnan(value) else f"{value:.4g}"

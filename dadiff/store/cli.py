@@ -14,6 +14,7 @@ from dadiff.store.cache import Cache, Entry, damage
 from dadiff.store.folder import is_store
 from dadiff.store.results import Results
 from dadiff.store.sweeps import Sweeps
+from dadiff.terminal import plain_table, text
 
 
 def users(output_dir: Path) -> Counter[tuple[str, str]]:
@@ -21,15 +22,15 @@ def users(output_dir: Path) -> Counter[tuple[str, str]]:
     return Counter(link for run in Results(output_dir) for link in run.record.links.items())
 
 
-def list_entries(output_dir: Path) -> list[str]:
-    """One line an entry: kind, key, size, state, number of runs that were made with it."""
-    counts = users(output_dir)
-    lines = [f"{'kind':<10} {'key':<16} {'size':>9}  {'state':<8}  runs"]
-    total = 0
-    for entry in Cache(output_dir).entries():
-        total += entry.size
-        lines.append(_line(entry, counts[entry.kind, entry.key]))
-    return [*lines, f"{'total':<10} {'':<16} {in_words(total):>9}"]
+def list_entries(output_dir: Path) -> str:
+    """A table: kind, key, size, state, number of runs that were made with it."""
+    counts, entries = users(output_dir), list(Cache(output_dir).entries())
+    table = plain_table("kind", "key", "size", "state", "runs")
+    table.columns[2].justify = table.columns[4].justify = "right"
+    for entry in entries:
+        table.add_row(entry.kind, entry.key, in_words(entry.size), entry.state, str(counts[entry.kind, entry.key]))
+    table.add_row("total", "", in_words(sum(entry.size for entry in entries)), "", "")
+    return text(table)
 
 
 def verify(output_dir: Path) -> list[str]:
@@ -97,7 +98,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _act(action: str, output_dir: Path, dry_run: bool) -> int:
     if action == "list":
-        lines, code = list_entries(output_dir), 0
+        lines, code = [list_entries(output_dir)], 0
     elif action == "verify":
         damaged = verify(output_dir)
         lines, code = damaged or ["every entry agrees with its checksums"], int(bool(damaged))
