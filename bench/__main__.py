@@ -14,6 +14,7 @@ PARTS = {  # module: threads; the batched solver's many small operations are slo
     "bench.obstacles": 1,
     "bench.fleet": 1,
     "bench.nonlinear": 1,
+    "bench.projections": 1,
 }
 
 

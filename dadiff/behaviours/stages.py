@@ -140,15 +140,17 @@ class BlockTridiagonal:
         added = (stages.B * W_u[..., None, :]) @ transposed(stages.B)
         unit = np.eye(layout.state_dim)
         added, measured = added + np.asarray(noise)[..., None, None, None] * unit, W_x[..., None] * unit
-        P, inverse, variance = measured[..., 0, :, :], [], []
-        over_time = (np.moveaxis(M, -3, 0) for M in (stages.A, added, measured[..., 1:, :, :]))
-        for t, (A, Q, W) in enumerate(zip(*over_time, strict=True)):
+        P, pivots, inverse, variance = measured[..., 0, :, :], [], [], []
+        over_time = (np.moveaxis(M, -3, 0) for M in (stages.A, transposed(stages.A), added, measured[..., 1:, :, :]))
+        for A, A_t, Q, W in zip(*over_time, strict=True):
             variance.append(P)
-            N = A @ P @ transposed(A) + Q
-            inverse.append(_inverted(N + W, t))
+            N = A @ P @ A_t + Q
+            pivots.append(N + W)
+            inverse.append(_inverted(pivots[-1]))
             P = W @ (inverse[-1] @ N)
             P = (P + transposed(P)) / 2
         S_inverse = np.stack(inverse, axis=-3)
+        _check_pivots(np.stack(pivots, axis=-3), S_inverse)
         carry = S_inverse[..., :-1, :, :] @ (W_x[..., 1:-1, :, None] * transposed(stages.A[..., 1:, :, :]))
         return cls(stages, (W_x[..., None, :], W_u[..., None, :]), S_inverse, carry, np.stack(variance, axis=-3))
 
@@ -179,15 +181,20 @@ class BlockTridiagonal:
         return multipliers, (filtered - smoothed, -W_u * (multipliers @ self.stages.B))
 
 
-def _inverted(S: np.ndarray, t: int) -> np.ndarray:
-    """S^-1, refused where a row follows from the others: by how much it does is S_ii (S^-1)_ii, whatever the units."""
+def _inverted(S: np.ndarray) -> np.ndarray:
+    """S^-1; nan where it has none."""
     try:
-        inverse = np.linalg.inv(S)
-        singular = np.einsum("...ii,...ii->...i", S, inverse).max() > NEARLY_DEPENDENT
+        return np.linalg.inv(S)
     except np.linalg.LinAlgError:
-        singular = True
-    if singular:
+        return np.full_like(S, np.nan)
+
+
+def _check_pivots(S: np.ndarray, inverse: np.ndarray) -> None:
+    """Refuse a row that follows from the others: by how much it does is S_ii (S^-1)_ii, whatever the units."""
+    dependence = np.einsum("...tii,...tii->...ti", S, inverse).max(axis=-1)
+    at = np.argwhere(~(dependence <= NEARLY_DEPENDENT))
+    if len(at):
         raise ConfigError(
-            f"projection: the pins leave nothing free with which the dynamics could hold at t = {t}; pin fewer entries"
+            "projection: the pins leave nothing free with which the dynamics could hold at t = "
+            f"{int(at[:, -1].min())}; pin fewer entries"
         )
-    return inverse
