@@ -16,6 +16,7 @@ from omegaconf import DictConfig
 from dadiff.commands import reported
 from dadiff.config.composed import plain
 from dadiff.config.trust import trust
+from dadiff.errors import ConfigError
 from dadiff.folders import shipped
 from dadiff.interface import components_named, configuration, settle
 
@@ -47,6 +48,8 @@ def _application(config: DictConfig) -> None:
 def check_what_is_printed(arguments: list[str]) -> None:
     """For `dadiff --cfg ...`, which Hydra answers without running anything: check the configuration first."""
     given = get_args_parser().parse_args(arguments)
+    if given.experimental_rerun is not None:
+        raise ConfigError("--experimental-rerun: is not offered, as it would load a pickle; give the overrides")
     if given.cfg is None:
         return
     from dadiff.config import assemble

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import sys
+import tempfile
 from collections.abc import Callable
+from pathlib import Path
 
 from dadiff.errors import DadiffError
 
@@ -17,6 +19,7 @@ def reported(program: str, work: Callable[[], int | None]) -> int:
     A full disk, a folder without rights and a lack of memory are such errors, wherever they occur.
     """
     try:
+        have_home()
         return work() or 0
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nobody reads what would still be flushed
@@ -28,6 +31,17 @@ def reported(program: str, work: Callable[[], int | None]) -> int:
         said = f" ({error})" if str(error) else ""
         sys.stderr.write(f"{program}: interrupted{said}; the same command goes on from what is stored\n")
         return INTERRUPTED
+
+
+def have_home() -> None:
+    """Give this process a home where it has none, as a user without an entry has none: MLflow looks for one."""
+    try:
+        Path.home()
+    except RuntimeError:
+        folder = Path(tempfile.gettempdir()) / f"dadiff-{os.getuid()}"
+        folder.mkdir(mode=0o700, exist_ok=True)
+        own = folder.stat().st_uid == os.getuid() and not folder.is_symlink()
+        os.environ["HOME"] = str(folder) if own else tempfile.mkdtemp(prefix="dadiff-")
 
 
 def in_one_line(error: BaseException) -> str:

@@ -13,6 +13,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 
 from dadiff import threads
+from dadiff.commands import have_home
 from dadiff.config.composed import plain
 from dadiff.config.trust import trust
 from dadiff.errors import ConfigError, StoreError
@@ -91,6 +92,7 @@ def components_named(overrides: Sequence[str]) -> list[str]:
 
 def settle() -> None:
     """Make this process ready for runs: threads, before torch is loaded, and what Hydra may do."""
+    have_home()
     os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
     if "torch" not in sys.modules:
         threads.settle()

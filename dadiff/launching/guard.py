@@ -87,7 +87,7 @@ class GuardedLoader(ConfigLoaderImpl):
             raise ConfigError(self._told(error, config_name)) from error
         if "output_dir" in config:
             check(config)
-            if run_mode == RunMode.MULTIRUN:
+            if run_mode == RunMode.MULTIRUN and validate_sweep_overrides:  # else Hydra only asks for its mode
                 check_sweep(config, overrides)
         return config
 
@@ -129,6 +129,8 @@ def _judging(load: Callable[[ConfigSource, str], ConfigResult]) -> Callable[[Con
 
 def one_line(error: BaseException) -> str:
     """A message of Hydra's or omegaconf's without its line breaks, and without the node that it was found in."""
+    if isinstance(error, RecursionError):
+        return "the configuration nests without end; does a preset name itself?"
     texts = [str(part) for part in (error, error.__cause__) if part is not None and str(part)]
     lines = [line.strip() for text in texts for line in text.splitlines()]
     return " ".join(line for line in lines if line and not line.startswith(("full_key:", "object_type=", "See https")))
@@ -237,6 +239,8 @@ def check_sweep(config: DictConfig, overrides: Sequence[str]) -> None:
     counts = {override.key_or_group: _count(override) for override in parsed if override.is_sweep_override()}
     if "output_dir" in counts:
         raise ConfigError("output_dir: the cells of a sweep share one output folder; give one")
+    if empty := [name for name, count in counts.items() if not count]:
+        raise ConfigError(f"{empty[0]}: ranges over nothing, so that the sweep has no cells")
     if (cells := math.prod(counts.values())) > MOST_CELLS:
         over = " x ".join(f"{count:,} {name}" for name, count in counts.items())
         raise ConfigError(

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from dadiff.launching.outcome import why
 from dadiff.running.identity import Identity, Shared
 from dadiff.running.provenance import record_of
-from dadiff.store import Results, Status, StoredRun
+from dadiff.store import Results, Status, StoredRun, is_read_only
 
 if TYPE_CHECKING:
     from dadiff.running.assembly import Experiment
@@ -24,10 +24,15 @@ def run(config: Mapping[str, Any]) -> StoredRun:
 
 
 def run_tracked(experiment: Experiment) -> StoredRun:
-    """Run what is assembled, and mirror whatever became of it, and its training, into MLflow."""
+    """Run what is assembled, and mirror whatever became of it, and its training, into MLflow.
+
+    What is done, in a folder that cannot be written to, is read.
+    """
     from dadiff.running.experiment import execute
 
     tracking, identity = experiment.parts.tracking, experiment.identity
+    if experiment.is_done and is_read_only(experiment.output_dir):
+        return experiment.results.read(identity.key)
     tracking.prepare()
     try:
         return execute(experiment)

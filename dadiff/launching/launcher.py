@@ -18,6 +18,7 @@ from hydra.plugins.launcher import Launcher
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig
 
+from dadiff.commands import in_one_line
 from dadiff.config.composed import plain
 from dadiff.errors import DadiffError
 from dadiff.launching.composing import Composer
@@ -28,7 +29,8 @@ from dadiff.launching.sweep import SweepRun, summary
 from dadiff.launching.table import Table
 from dadiff.launching.work import Running, Work
 from dadiff.running.summary import several_runs
-from dadiff.store import DONE, Lease, Sweeps
+from dadiff.store import DONE, Lease, Sweeps, is_read_only
+from dadiff.store.names import sweep_name
 
 
 class SweepLauncher(Launcher):
@@ -54,8 +56,8 @@ class SweepLauncher(Launcher):
         """Run the cells. Leaves with exit code 1 if any failed, 130 if interrupted."""
         try:
             code = self._launch(job_overrides)
-        except DadiffError as error:
-            sys.stderr.write(f"dadiff: error: {error}\n")
+        except (DadiffError, OSError) as error:
+            sys.stderr.write(f"dadiff: error: {in_one_line(error)}\n")
             code = 1
         if code:
             raise SystemExit(code)
@@ -63,13 +65,22 @@ class SweepLauncher(Launcher):
 
     def _launch(self, job_overrides: Sequence[Sequence[str]]) -> int:
         plan = make_plan([plain(*self.composer.cell(self.config, cell)) for cell in job_overrides])
+        name = self._name()
         if plan.cells[0].config.get("dry_run"):
             sys.stdout.write(describe(plan) + "\n")
             return 0
-        name = self.sweep or self.config.hydra.runtime.choices.get("sweeps")
         run = SweepRun.of(plan, name, "dadiff " + shlex.join(sys.argv[1:]), definition(self.config))
+        if not plan.waiting and is_read_only(run.output_dir):
+            sys.stderr.write(f"{summary(run.record(run.cells()), len(plan.cells), run.folder)}\n")
+            return 0
         with Sweeps(run.output_dir).running(run.name) as lease:
             return self._run(run, lease)
+
+    def _name(self) -> str | None:
+        """The sweep's, as given or as that of its file, which may lie in a folder; None if it has none."""
+        chosen = self.config.hydra.runtime.choices.get("sweeps")
+        name = self.sweep or (chosen and str(chosen).replace("/", "-"))
+        return sweep_name(name) if name else None
 
     def _run(self, run: SweepRun, lease: Lease) -> int:
         """Run what is to be run; returns the exit code."""

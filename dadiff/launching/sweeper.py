@@ -23,4 +23,6 @@ class CellSweeper(BasicSweeper):
         parser = OverridesParser.create(config_loader=self.hydra_context.config_loader)
         overrides = parser.parse_overrides([*self._parse_config(), *arguments])
         batches = self.split_arguments(overrides, self.max_batch_size)
+        if not batches[0]:
+            raise ConfigError("the sweep has no cells: one of its parameters ranges over nothing")
         return [self.launcher.launch(batch, initial_job_idx=0) for batch in batches]

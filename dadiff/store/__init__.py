@@ -4,7 +4,7 @@ Everything is written under a temporary name and renamed, so that a reader finds
 """
 
 from dadiff.store.cache import Cache, Entry
-from dadiff.store.folder import store_id
+from dadiff.store.folder import is_read_only, store_id
 from dadiff.store.record import DONE, Provenance, Record, Status
 from dadiff.store.results import Results, StoredRun
 from dadiff.store.sweeps import Cell, Lease, Sweep, Sweeps
@@ -22,5 +22,6 @@ __all__ = [
     "StoredRun",
     "Sweep",
     "Sweeps",
+    "is_read_only",
     "store_id",
 ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import uuid
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,6 +35,11 @@ def store_id(output_dir: Path | str) -> str:
             if not path.is_file():
                 write_json(path, {"id": uuid.uuid4().hex})
     return read_typed(path, Store).id
+
+
+def is_read_only(output_dir: Path | str) -> bool:
+    """Whether the folder is there and this process may not write to it."""
+    return os.path.isdir(output_dir) and not os.access(output_dir, os.W_OK)
 
 
 def is_store(output_dir: Path | str) -> bool:

@@ -93,6 +93,8 @@ def _create(path: Path) -> None:
         left.unlink()
     making = path.with_name(f".{path.name}.making")
     SqlAlchemyStore(SQLITE + str(making), str(path.parent / "mlartifacts")).engine.dispose()
+    shared = path.parent.stat().st_mode & 0o060  # SQLite gives no rights to a group, whatever the umask
+    making.chmod(making.stat().st_mode | shared)
     making.rename(path)
     SqlAlchemyStore._get_or_create_engine(SQLITE + str(path)).dispose()  # connections of this process to what lay here
 
