@@ -17,6 +17,7 @@ from dadiff.behaviours import (
     IdentifiedSoft,
     Inpainting,
     Known,
+    Koopman,
     NoProjector,
     Pin,
     Projection,
@@ -187,7 +188,9 @@ class TestOrthogonalProjectors:
         known = bind(Known(projector.initial_state), system, x_init, coordinates)
         np.testing.assert_allclose(P(z), known(z), atol=close(system, np.abs(known(z)).max()))
         held = pins(projector, system.layout(HORIZON), x_init)
-        assert compared(fit(projector, system), fit(Known(), system), held)["principal_angle"] < close(system)
+        angles = compared(fit(projector, system), fit(Known(), system), held)
+        if not isinstance(projector, Koopman):  # whose set is another one for each x(0)
+            assert angles["principal_angle"] < close(system)
 
 
 @pytest.mark.parametrize("projector", HOLDING.values(), ids=HOLDING.keys())
@@ -300,7 +303,7 @@ def test_noise_leaves_a_gap_behind_the_rank_of_the_dynamics():
     assert gaps[1] > gaps[2]
 
 
-LEARNED = {name: p for name, p in PROJECTORS.items() if "recording" in p.needs}
+LEARNED = {name: p for name, p in PROJECTORS.items() if "recording" in p.needs and not isinstance(p, Koopman)}
 FROM_HANKEL = {name: p for name, p in LEARNED.items() if isinstance(p, Hankel | HankelLowRank)}
 
 

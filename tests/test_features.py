@@ -5,10 +5,22 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dadiff.behaviours import Dynamics, Identified, IdentifiedSoft, Known, Manifold, pins, prediction_error
+from dadiff.behaviours import (
+    Dynamics,
+    Identified,
+    IdentifiedSoft,
+    Known,
+    Koopman,
+    Lifted,
+    Manifold,
+    Pin,
+    pins,
+    prediction_error,
+)
 from dadiff.errors import ConfigError, ExcitationError, NotApplicableError, ShapeError
-from dadiff.systems import GaussianExcitation, PlanarQuadrotors, Simulated, double_integrator
+from dadiff.systems import GaussianExcitation, PlanarQuadrotors, Recording, Simulated, double_integrator
 from dadiff.systems.features import Features, Regressed
+from dadiff.trajectory.covariance import Covariance
 
 TERMS = [
     ("constant", "identity"),
@@ -31,7 +43,7 @@ def test_derivatives_agree_with_differences(terms, robots, rng):
     lead = () if robots is None else (robots,)
     system = Regressed(phi, 0.1 * rng.standard_normal((*lead, 3, phi.count)))
     x, u = rng.standard_normal((*lead, 5, 3)), rng.standard_normal((*lead, 5, 2))
-    differences = Simulated(system.step, 3, 2, num_robots=robots)
+    differences = Simulated(system.step, 3, 2, robots=robots)
     for found, expected in zip(system.linearise(x, u), differences.linearise(x, u), strict=True):
         np.testing.assert_allclose(found, expected, atol=1e-8)
 
@@ -97,3 +109,38 @@ def test_what_makes_no_sense_is_refused(rng):
     soft, shown = IdentifiedSoft(features=("identity",)), rng.standard_normal((9, layout.size))
     with pytest.raises(NotApplicableError, match="use projector=identified"):
         soft.fit(layout, system, recording, shown)
+
+
+@pytest.mark.parametrize("directions", [0, 4])
+def test_koopman_of_linear_dynamics_is_the_affine_projection(directions, rng):
+    system = double_integrator(process_noise=0.0)
+    recording, layout = GaussianExcitation(100).record(system), system.layout(6)
+    metric = Covariance(rng.uniform(0.5, 2, layout.size), rng.standard_normal((layout.size, directions)))
+    pin, tau = Pin.initial_state(layout, rng.standard_normal((5, 4))), rng.standard_normal((5, layout.size))
+    found = Koopman().fit(layout, system, recording)
+    expected = Known().fit(layout, system)
+    for C in (None, metric):
+        np.testing.assert_allclose(found.bind(None, [pin])(tau, C), expected.bind(None, [pin])(tau, C), atol=1e-8)
+
+
+def test_koopman_finds_what_closes_on_its_observables(rng):
+    """x1+ = a x1 + u, x2+ = b x2 + c x1^2: with x1^2 observed it is linear where no input acts on x1^2."""
+    truth = Simulated(lambda x, u: np.stack([0.9 * x[..., 0], 0.5 * x[..., 1] + x[..., 0] ** 2 + u[..., 0]], -1), 2, 1)
+    states = truth.simulate(rng.standard_normal((30, 2)), inputs := rng.standard_normal((30, 5, 1)))
+    layout = truth.layout(5)
+    found = Koopman(features=("products",), ridge=1e-12).fit(layout, truth, Recording(states[:, :], inputs))
+    assert isinstance(found, Lifted)
+    tau = layout.flatten(states, inputs)
+    assert prediction_error(found, truth, tau)["prediction_error"] < 1e-3
+    linear = Koopman().fit(layout, truth, Recording(states, inputs))
+    assert prediction_error(linear, truth, tau)["prediction_error"] > 0.1
+    project = found.bind(None, [Pin.initial_state(layout, states[:, 0])])
+    np.testing.assert_allclose(project(tau), tau, atol=1e-2)
+
+
+def test_koopman_lifts_at_x0_and_sees_states_alone():
+    layout = double_integrator().layout(5)
+    with pytest.raises(ConfigError, match=r"pin x\(0\), and nothing else"):
+        Koopman().fit(layout, None, GaussianExcitation(50).record(double_integrator())).bind()
+    with pytest.raises(ConfigError, match="observables are of states alone"):
+        Koopman(features=("control_affine",))

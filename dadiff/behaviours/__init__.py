@@ -8,12 +8,14 @@ from dadiff.behaviours.components import (
     IdentifiedSoft,
     Inpainting,
     Known,
+    Koopman,
     NoProjector,
     Projector,
     RolloutProjector,
     pins,
 )
 from dadiff.behaviours.least_squares import Estimate, Transitions, least_squares
+from dadiff.behaviours.lifted import Lifted
 from dadiff.behaviours.manifold import Manifold
 from dadiff.behaviours.pins import Pin
 from dadiff.behaviours.prediction import prediction_error
@@ -32,6 +34,8 @@ __all__ = [
     "IdentifiedSoft",
     "Inpainting",
     "Known",
+    "Koopman",
+    "Lifted",
     "Manifold",
     "NoProjector",
     "Pin",

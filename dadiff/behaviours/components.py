@@ -13,7 +13,8 @@ from typing import ClassVar, Literal, Protocol, TypeVar
 import numpy as np
 
 from dadiff.behaviours.bounded import Bounded
-from dadiff.behaviours.least_squares import Offset, Transitions, least_squares, regressed
+from dadiff.behaviours.least_squares import Offset, Transitions, least_squares, lifted, regressed
+from dadiff.behaviours.lifted import Lifted
 from dadiff.behaviours.manifold import Manifold
 from dadiff.behaviours.pins import Pin
 from dadiff.behaviours.sets import Dynamics, Everything, InitialState, Rollout, Span, TrajectorySet, Uncertain
@@ -283,6 +284,46 @@ class IdentifiedSoft(Identified):
         deviation = float(np.sqrt(np.square(spread).sum(axis=-1).mean()))
         notes = {"rank": layout.rank, "residual_deviation": deviation}
         return Uncertain(layout, estimate.stages(layout.horizon), spread, notes=notes)
+
+
+@dataclass(frozen=True)
+class Koopman:
+    """Extended dynamic mode decomposition: least squares for psi(x(t+1)) = K psi(x(t)) + B u(t).
+
+    Args:
+        features: observables besides the states: constant, trigonometric, products; see `dadiff.systems.features`.
+        angles: indices of the states whose sines and cosines are observed.
+        ridge: weight of |[K, B]|^2 against the squared residuals, observables scaled to deviation 1.
+    """
+
+    needs: ClassVar[frozenset[str]] = RECORDING
+    initial_state: ClassVar[InitialState] = "fixed"
+
+    features: Sequence[Term] = ("constant",)
+    angles: Sequence[int] = ()
+    ridge: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("features", "angles"):
+            object.__setattr__(self, name, tuple(getattr(self, name)))
+        if "control_affine" in self.features:
+            raise ConfigError("projector koopman: observables are of states alone, and control_affine is of inputs")
+        if not 0 <= self.ridge < np.inf:
+            raise ConfigError(f"projector: ridge is {self.ridge}; it must be finite and not negative")
+
+    def fit(
+        self,
+        layout: TrajectoryLayout,
+        system: System | None = None,
+        recording: Recording | None = None,
+        demonstrations: np.ndarray | None = None,
+    ) -> Lifted:
+        """The trajectories of the lifted dynamics."""
+        recording = _required(recording, "koopman", "recording")
+        data = Transitions.of(recording.states, recording.inputs)
+        psi = Features(layout.state_dim, 0, ("identity", *self.features), self.angles)
+        K, B = lifted(data, psi, self.ridge)
+        return Lifted(layout, psi, K, B, notes={"rank": layout.rank, "observables": psi.count})
 
 
 @dataclass(frozen=True)

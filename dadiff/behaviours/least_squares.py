@@ -163,13 +163,31 @@ def regressed(data: Transitions, features: Features, ridge: float = 0.0) -> Regr
         ExcitationError: if the features do not vary independently of one another, and nothing else decides (ridge = 0).
     """
     Phi = features(data.x, data.u)
+    _check_features(Phi, ridge)
+    theta, spread, noise = regression(Phi, data.following - data.x, ridge)
+    return Regression(Regressed(features, theta), spread, noise)
+
+
+def lifted(data: Transitions, observables: Features, ridge: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """K (*robots, p, p) and B (*robots, p, m) of psi(x(t+1)) = K psi(x(t)) + B u(t), from transitions.
+
+    Raises:
+        ExcitationError: as `regressed`.
+    """
+    none = np.zeros((*data.x.shape[:-1], 0))
+    now, following = observables(data.x, none), observables(data.following, none)
+    Phi, p = np.concatenate([now, data.u], axis=-1), now.shape[-1]
+    _check_features(Phi, ridge)
+    theta, _, _ = regression(Phi, following - now, ridge)
+    return np.eye(p) + theta[..., :p], theta[..., p:]
+
+
+def _check_features(Phi: np.ndarray, ridge: float) -> None:
     if not ridge and (rank := numerical_rank(Phi)) < Phi.shape[-1]:
         raise ExcitationError(
             f"recording: its {Phi.shape[-2]} transitions span {rank} of the {Phi.shape[-1]} features; record longer, "
             "with inputs that vary more, choose fewer features or a ridge"
         )
-    theta, spread, noise = regression(Phi, data.following - data.x, ridge)
-    return Regression(Regressed(features, theta), spread, noise)
 
 
 def _check_rank(Phi: np.ndarray, needed: int) -> None:

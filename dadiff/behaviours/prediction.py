@@ -6,6 +6,7 @@ from typing import Protocol
 
 import numpy as np
 
+from dadiff.behaviours.lifted import Lifted
 from dadiff.behaviours.manifold import Manifold
 from dadiff.behaviours.sets import Dynamics, TrajectorySet
 from dadiff.systems import System
@@ -43,4 +44,6 @@ def prediction_error(learned: TrajectorySet, truth: System, tau: np.ndarray) -> 
 def _dynamics(learned: TrajectorySet) -> Simulable | None:
     if isinstance(learned, Manifold):
         return learned.system
+    if isinstance(learned, Lifted):
+        return learned
     return learned.stages if isinstance(learned, Dynamics) else None

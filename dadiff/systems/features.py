@@ -2,11 +2,11 @@
 
 phi is put together from terms, in this order; s(x) stands for the state features:
 
-    constant        1
     identity        x and u
     trigonometric   sin and cos of chosen entries of x
     products        s_i s_j of the above, without the squares of cosines
     control_affine  u_k times sin and cos where there are any, and times x otherwise
+    constant        1
 """
 
 from __future__ import annotations
@@ -59,13 +59,14 @@ class Features:
     def __call__(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
         """phi, (..., p)."""
         s = self._of_states(x)
-        parts = [np.ones((*x.shape[:-1], 1))] if "constant" in self.terms else []
-        parts += [s, u] if "identity" in self.terms else [s]
+        parts = [s, u] if "identity" in self.terms else [s]
         if "products" in self.terms:
             i, j = self._pairs(s.shape[-1])
             parts.append(s[..., i] * s[..., j])
         if "control_affine" in self.terms:
             parts.append(_outer(u, self._steering(s)))
+        if "constant" in self.terms:
+            parts.append(np.ones((*x.shape[:-1], 1)))
         return np.concatenate(parts, axis=-1)
 
     def jacobian(self, x: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -76,8 +77,7 @@ class Features:
         def none(rows: int, columns: int) -> np.ndarray:
             return np.zeros((*lead, rows, columns))
 
-        blocks = [(none(1, n), none(1, m))] if "constant" in self.terms else []
-        blocks.append((ds, none(s.shape[-1], m)))
+        blocks = [(ds, none(s.shape[-1], m))]
         if "identity" in self.terms:
             blocks.append((none(m, n), np.broadcast_to(np.eye(m), (*lead, m, m))))
         if "products" in self.terms:
@@ -88,6 +88,8 @@ class Features:
             steering, slope = self._steering(s), self._steering(ds.swapaxes(-1, -2)).swapaxes(-1, -2)
             by_x = (u[..., :, None, None] * slope[..., None, :, :]).reshape(*lead, -1, n)
             blocks.append((by_x, (np.eye(m)[:, None, :] * steering[..., None, :, None]).reshape(*lead, -1, m)))
+        if "constant" in self.terms:
+            blocks.append((none(1, n), none(1, m)))
         dx, du = zip(*blocks, strict=True)
         return np.concatenate(dx, axis=-2), np.concatenate(du, axis=-2)
 
