@@ -10,9 +10,10 @@ import torch
 from laws import fleet, members, trajectories
 
 from dadiff.errors import ConfigError
-from dadiff.evaluation import Evaluation, replay, spread, tracking_errors
+from dadiff.evaluation import Evaluation, replay, spread, tracking_errors, violations
 from dadiff.evaluation.errors import dynamics_residual
 from dadiff.evaluation.records import Snapshots, headline, long_table, merged, tables
+from dadiff.systems import Bounds
 from dadiff.tasks import Cases, Scores
 from dadiff.trajectory import Channel, Layout
 
@@ -143,3 +144,20 @@ def test_spread_is_the_trace_of_the_covariance_of_a_cases_plans():
     assert spread(planned).headline == {"spread": found["spread"]}
     assert spread(planned, covariance_trace=0.0).headline == {"spread": found["spread"]}
     assert spread(planned[:, :1]).headline == {}
+
+
+def test_a_violation_is_the_largest_of_a_plan_over_entries_and_time(system, rng):
+    cases, layout = some_cases(system), system.layout(HORIZON)
+    bounded = replace(system, bounds=Bounds(input_high=0.5, state_low=-1.0))
+    planned = rng.standard_normal((CASES, SAMPLES, layout.size))
+    planned[0, 0] = 0.25
+    x, u = layout.split(planned)
+    expected = np.maximum((u - 0.5).max((-2, -1)), (-1.0 - x).max((-2, -1))).clip(0)
+    rollout = replay(system, layout, planned, cases.x_init)
+    scores = violations(bounded, layout, planned, rollout)
+    np.testing.assert_allclose(scores.per_plan["violation"], expected)
+    np.testing.assert_array_equal(scores.per_plan["violating"], expected > 0)
+    assert scores.per_plan["violating"][0, 0] == 0
+    assert headline(scores)["largest_violation"] == expected.max()
+    assert (scores.per_plan["rollout_violation"] >= (u - 0.5).max((-2, -1)).clip(0)).all()
+    assert violations(system, layout, planned, rollout) == Scores()

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cvxpy as cp
 import numpy as np
 import pytest
-from laws import AFFINE, fleet, members
+from laws import AFFINE, SYSTEMS, fleet, members
 
 from dadiff.behaviours import Known, pins
 from dadiff.datasets import Generated
@@ -14,7 +16,7 @@ from dadiff.evaluation import replay
 from dadiff.evaluation.errors import dynamics_residual
 from dadiff.experts.lqr import closed_loop_law, follow, optimal_feedback, stationary_feedback
 from dadiff.randomness import numpy_generator
-from dadiff.systems import AffineSystem, DampedIntegrators, Linear, double_integrator
+from dadiff.systems import AffineSystem, Bounds, DampedIntegrators, Linear, double_integrator
 from dadiff.tasks import LQR, Fleet
 from dadiff.tasks.obstacles import Obstacles
 from dadiff.trajectory.response import along
@@ -245,6 +247,39 @@ def test_the_cost_ratio_is_1_at_the_optimum_and_more_elsewhere(system, rng):
     stationary = task_for(system, expert="stationary")
     theirs = stationary.cases(system, 4, numpy_generator(0, "test")).reference[:, None]
     assert (stationary.score(system, cases, theirs, theirs).per_plan["cost_ratio"] >= 1 - 1e-12).all()
+
+
+def test_within_bounds_the_reference_is_the_optimum_among_what_keeps_them(affine):
+    m, task = affine.input_dim, full_task(affine)
+    largest = np.abs(affine.layout(12).inputs(task.cases(affine, 5, numpy_generator(0, "test")).reference)).max()
+    bounded = replace(affine, bounds=Bounds(input_low=-largest / 2, input_high=np.full(m, largest / 2)))
+    cases, layout = task.cases(bounded, 5, numpy_generator(0, "test")), bounded.layout(12)
+    states, inputs = layout.split(cases.reference)
+    np.testing.assert_allclose(np.abs(inputs).max(), largest / 2, rtol=1e-6)
+    np.testing.assert_allclose(bounded.simulate(cases.x_init, inputs), states, atol=1e-6 * np.abs(states).max())
+    planned = np.stack([cases.reference, task.solve(bounded, cases.environment)], axis=-2)
+    scores = task.score(bounded, cases, planned, planned).per_plan
+    np.testing.assert_allclose(scores["bounded_cost_ratio"][:, 0], 1, rtol=1e-12)
+    assert scores["cost_ratio"].min() >= 1 - 1e-6  # the free optimum costs least
+    assert (scores["bounded_cost_ratio"][:, 1] <= 1 + 1e-6).all()
+    wide = replace(affine, bounds=Bounds(input_high=1e3 * largest, state_low=-1e6))
+    free = task.mean(affine, cases.environment)
+    np.testing.assert_allclose(task.mean(wide, cases.environment), free, atol=1e-4 * np.abs(free).max())
+
+
+def test_within_bounds_a_fleet_is_its_robots_one_by_one():
+    robots = replace(fleet(), bounds=Bounds(input_low=-0.5, input_high=0.5))
+    task = task_for(robots)
+    E = task.sample_environments(robots, (3, 2), numpy_generator(0, "test"))
+    alone = [replace(robot, bounds=robots.bounds) for robot in members(robots)]
+    expected = np.stack([task.mean(one, e) for one, e in zip(alone, E, strict=True)])
+    np.testing.assert_allclose(task.mean(robots, E), expected, atol=1e-9)
+
+
+def test_a_start_out_of_bounds_has_no_optimum_and_is_named():
+    system = replace(SYSTEMS["paper"], bounds=Bounds(state_high=1.0))
+    with pytest.raises(InfeasibleError, match=r"from x_init = \[2.0, 0.0, 0.0, 0.0\] no trajectory within"):
+        task_for(system).mean(system, np.array([[2.0, 0, 0, 0, 0, 0, 0, 0]]))
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,6 @@
 """Evaluation: what can be said of plans of any task."""
 
-from dadiff.evaluation.errors import replay, spread, tracking_errors
+from dadiff.evaluation.errors import replay, spread, tracking_errors, violations
 from dadiff.evaluation.settings import ClosedLoop, Evaluation, Exact
 
-__all__ = ["ClosedLoop", "Evaluation", "Exact", "replay", "spread", "tracking_errors"]
+__all__ = ["ClosedLoop", "Evaluation", "Exact", "replay", "spread", "tracking_errors", "violations"]

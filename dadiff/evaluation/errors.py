@@ -12,6 +12,9 @@ from dadiff.systems import System
 from dadiff.tasks import Cases, Scores
 from dadiff.trajectory.layout import TrajectoryLayout
 
+VIOLATION = 1e-8
+"""By how much a plan must exceed a bound to count as violating it: more than rounding in scaled coordinates."""
+
 
 def _squared(difference: np.ndarray) -> np.ndarray:
     return np.square(difference).sum(axis=-1)
@@ -45,6 +48,28 @@ def spread(planned: np.ndarray, covariance_trace: float | None = None) -> Scores
     found = {"spread": float(planned.var(axis=-2, ddof=1).sum(axis=-1).mean())}
     ratio = {"spread_ratio": found["spread"] / covariance_trace} if covariance_trace else {}
     return Scores(headline=found | ratio)
+
+
+def violations(system: System, layout: TrajectoryLayout, planned: np.ndarray, rollout: np.ndarray) -> Scores:
+    """By how much plans exceed the system's bounds, where it has any.
+
+    `violation` is a plan's largest, in the units of what is exceeded, `violating` whether it is more than VIOLATION;
+    `rollout_violation` is that of the replay. `largest_violation` is that of all plans.
+    """
+    if not system.bounds.any:
+        return Scores()
+    violation, replayed = (_beyond(system, layout, tau) for tau in (planned, rollout))
+    violating = (violation > VIOLATION).astype(float)
+    per_plan = {"violation": violation, "violating": violating, "rollout_violation": replayed}
+    return Scores(per_plan=per_plan, headline={"largest_violation": float(violation.max())})
+
+
+def _beyond(system: System, layout: TrajectoryLayout, tau: np.ndarray) -> np.ndarray:
+    """max(low - tau, tau - high, 0) over the entries of tau (..., d): (...)."""
+    bounds = system.bounds.of_states(layout.state_dim), system.bounds.of_inputs(layout.input_dim)
+    parts = zip(layout.split(tau), bounds, strict=True)
+    exceeded = [np.maximum(low - part, part - high).max(axis=(-2, -1)) for part, (low, high) in parts]
+    return np.maximum(np.maximum(*exceeded), 0.0)
 
 
 def tracking_errors(

@@ -19,7 +19,7 @@ from dadiff.behaviours import Known, compared, pins, prediction_error
 from dadiff.diffusion.chain import Samples
 from dadiff.diffusion.enforcement import PostHoc
 from dadiff.errors import NotApplicableError
-from dadiff.evaluation import ClosedLoop, Exact, replay, spread, tracking_errors
+from dadiff.evaluation import ClosedLoop, Exact, replay, spread, tracking_errors, violations
 from dadiff.evaluation.closed_loop import Bench, latencies, means
 from dadiff.evaluation.mahalanobis import MahalanobisDistance
 from dadiff.evaluation.records import ChainRecorder, Snapshots, headline, merged, tables
@@ -103,6 +103,7 @@ def draw_plans(experiment: Experiment) -> Plans:
     measures |= {"sampling_seconds": elapsed, "network_calls": samples.network_calls}
     if project and project.calls:
         measures |= {"projection_seconds": project.seconds / project.calls, "projection_calls": project.calls}
+        measures |= unconverged(project.function)
     tau = samples.tau.cpu().numpy().reshape(*cases.environment.shape[:-1], evaluation.samples, -1)
     return Plans(experiment.coordinates.to_physical(tau), samples, measures, chain, snapshots)
 
@@ -122,6 +123,12 @@ def measured_projection(experiment: Experiment, environment: np.ndarray) -> tupl
         measures |= compared(behaviour, Known().fit(experiment.layout, experiment.target), held)
         measures |= prediction_error(behaviour, experiment.target, experiment.cases.reference)
     return Timed(projection, experiment.device), measures
+
+
+def unconverged(projection: Any) -> dict[str, float]:
+    """How many plans the last projection did not bring into the set; nothing of closed forms, which always do."""
+    info = projection.info
+    return {} if info.kind in ("dense", "blocks") else {"unconverged": info.unconverged}
 
 
 def _observers(experiment: Experiment, environment: np.ndarray) -> tuple[ChainRecorder | None, Snapshots]:
@@ -177,6 +184,7 @@ def evaluate(experiment: Experiment, planned: np.ndarray) -> Scores:
     return merged(
         tracking_errors(system, layout, cases, planned, rollout),
         spread(planned, experiment.covariance_trace),
+        violations(system, layout, planned, rollout),
         experiment.parts.task.score(system, cases, planned, rollout),
     )
 

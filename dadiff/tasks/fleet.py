@@ -8,7 +8,7 @@ each robot solved by its own optimum. Every test robot is given the same cases.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar
 
@@ -95,13 +95,16 @@ class Fleet(ManyRobots):
         """`count` cases, the same for every robot, each with the robot's own optimum and one recording a robot."""
         environment = self.lqr.sample_environments(system, (count,), rng)
         environment = np.broadcast_to(environment, (*system.robots, *environment.shape))
-        reference = self.lqr.law(system).mean(environment)
+        reference = self.lqr.mean(system, environment)
         condition = self.told(ends_layout(system), environment, system, 1, rng)
         return Cases(self.condition(system), condition, reference)
 
     def score(self, system: LinearRobots, cases: Cases, planned: np.ndarray, rollout: np.ndarray) -> Scores:
-        """The cost after replay, relative to each robot's own optimum; see `scores_of`."""
-        return scores_of(system, self.lqr.score(system, cases, planned, rollout).per_plan["cost_ratio"])
+        """The cost after replay, relative to each robot's own optimum, and to that within bounds; see `scores_of`."""
+        ratios = self.lqr.score(system, cases, planned, rollout).per_plan
+        scores = scores_of(system, ratios["cost_ratio"])
+        bounded = {name: ratios[name] for name in ("bounded_cost_ratio",) if name in ratios}
+        return replace(scores, per_plan=scores.per_plan | bounded)
 
     def solve(self, system: LinearRobots, environment: np.ndarray) -> np.ndarray:
         """Each robot's optimum tau (robots, ..., d) without process noise for E (robots, ..., c)."""

@@ -53,6 +53,9 @@ class LQR:
         expert: `optimal` is the finite-horizon affine optimum, `stationary` the infinite-horizon gain.
         reference: a test case's reference is the controller's trajectory without process noise (`mean`), or
             one noisy run of it (`realised`).
+
+    Where the system has bounds, the mean reference is the optimum within them. The controller, whose runs are the
+    demonstrations and `solve`, knows none.
     """
 
     version: ClassVar[str] = "lqr-v1"
@@ -154,11 +157,22 @@ class LQR:
     def cases(self, system: AffineSystem, count: int, rng: np.random.Generator) -> Cases:
         """`count` cases for each robot of the system."""
         environment = self.sample_environments(system, (*system.robots, count), rng)
-        if self.reference == "realised":
-            reference = self.realise(system, environment, rng)
-        else:
-            reference = self.law(system).mean(environment)
+        realised = self.reference == "realised"
+        reference = self.realise(system, environment, rng) if realised else self.mean(system, environment)
         return Cases(self.condition(system), environment, reference)
+
+    def mean(self, system: AffineSystem, environment: np.ndarray) -> np.ndarray:
+        """The reference (*robots, cases, d) without process noise for E (*robots, cases, 2n), within bounds.
+
+        Raises:
+            InfeasibleError: if no trajectory within bounds starts from a case's x_init.
+        """
+        if not system.bounds.any:
+            return self.law(system).mean(environment)
+        from dadiff.experts.bounded import Costs, optimum_within
+
+        cost, ends = self.cost(system), ends_layout(system).unpack(environment)
+        return optimum_within(system, Costs(cost.Q, cost.R, cost.terminal), self.horizon, **ends)
 
     def realise(self, system: AffineSystem, environment: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """One noisy run of the expert for each E (*robots, ..., 2n): tau of shape (*robots, ..., d)."""
@@ -185,11 +199,17 @@ class LQR:
 
         Spread is the trace of the covariance of a case's plans over that of the law of optimal trajectories, 1 for
         right samples: each plan's squared distance from their mean, S / (S - 1) times, over the trace.
+
+        Where the system has bounds that optimum may exceed them, and `bounded_cost_ratio` is over the optimum within.
         """
         cost, target, layout = self.cost(system), cases.get("target"), system.layout(self.horizon)
         optimum = self.solve(system, ends_layout(system).pack(x_init=cases.x_init, target=target))
-        ratio = cost(*layout.split(rollout), target[..., None, :]) / cost(*layout.split(optimum), target)[..., None]
-        return Scores(per_plan={"cost_ratio": ratio, **self._spread(system, planned)})
+        spent = cost(*layout.split(rollout), target[..., None, :])
+        against = {"cost_ratio": optimum}
+        if system.bounds.any and self.reference == "mean":
+            against["bounded_cost_ratio"] = cases.reference
+        ratios = {name: spent / cost(*layout.split(tau), target)[..., None] for name, tau in against.items()}
+        return Scores(per_plan={**ratios, **self._spread(system, planned)})
 
     def _spread(self, system: AffineSystem, planned: np.ndarray) -> dict[str, np.ndarray]:
         """Nothing of single plans, and where optimal trajectories have no spread."""
