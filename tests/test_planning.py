@@ -7,6 +7,7 @@ import pickle
 import subprocess
 import sys
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,16 +15,19 @@ import pandas as pd
 import pytest
 from safetensors.numpy import save as arrays_to_bytes
 
-from dadiff.behaviours import Known
+from dadiff.behaviours import HankelLowRank, IdentifiedSoft, Inpainting, Known, TrajectorySet
 from dadiff.denoisers import MLP, Gaussian
+from dadiff.diffusion.conditional import Conditional
 from dadiff.diffusion.enforcement import CleanEstimate
+from dadiff.diffusion.estimate import Estimate
 from dadiff.diffusion.samplers import DDIM
 from dadiff.diffusion.schedule import paper_linear
 from dadiff.errors import CheckpointError, DadiffError, DataError, ShapeError
 from dadiff.planning import Planner, Plans
 from dadiff.planning.cli import main
 from dadiff.randomness import torch_generator
-from dadiff.systems import Linear, double_integrator
+from dadiff.systems import GaussianExcitation, Linear, double_integrator
+from dadiff.systems.system import Bounds
 from dadiff.tasks import LQR
 from dadiff.trajectory.coordinates import physical
 
@@ -278,3 +282,22 @@ def test_errors_are_dadiffs_own(tmp_path):
         Planner.load(tmp_path / "nowhere.zip")
     with pytest.raises(DadiffError, match=r"holds no planner.json"):
         Planner.load(tmp_path)
+
+
+def every_set() -> dict[str, TrajectorySet]:
+    shown = TASK.demonstrations(SYSTEM, 50, np.random.default_rng(0)).trajectories
+    recording = GaussianExcitation(length=200).record(SYSTEM)
+    limited = replace(SYSTEM, bounds=Bounds(-2.0, 2.0))
+    learned = {kind.__name__: kind().fit(LAYOUT, SYSTEM, recording, shown) for kind in (HankelLowRank, IdentifiedSoft)}
+    plain = {kind.__name__: kind().fit(LAYOUT, SYSTEM) for kind in (Inpainting, Known)}
+    return {**learned, **plain, "Bounded": Known(bounded=True).fit(LAYOUT, limited)}
+
+
+@pytest.mark.parametrize("name", ["HankelLowRank", "IdentifiedSoft", "Inpainting", "Known", "Bounded"])
+@pytest.mark.parametrize("enforcement", [Conditional(), Conditional(spread=True), CleanEstimate()], ids=str)
+def test_every_set_and_the_estimates_law_are_in_the_file(tmp_path, name, enforcement):
+    shown = TASK.demonstrations(SYSTEM, 300, np.random.default_rng(0))
+    weighed = Estimate.of_demonstrations(LAYOUT, physical(LAYOUT), shown.trajectories, shown.environment)
+    before = replace(planner(), behaviour=every_set()[name], enforcement=enforcement, estimate=weighed)
+    after = Planner.load(before.save(tmp_path / "robot.zip"))
+    np.testing.assert_array_equal(plan_of(after).tau, plan_of(before).tau)
