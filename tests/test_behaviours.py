@@ -33,9 +33,10 @@ from dadiff.behaviours import (
 )
 from dadiff.errors import ConfigError, ExcitationError, ShapeError
 from dadiff.systems import GaussianExcitation, Linear, Recording, double_integrator
+from dadiff.trajectory import Channel, Layout
 from dadiff.trajectory.coordinates import Coordinates, physical
 from dadiff.trajectory.covariance import Covariance
-from dadiff.trajectory.hankel import identity_length, minimum_length
+from dadiff.trajectory.hankel import identity_length, minimum_length, windows
 
 HORIZON, PLANS = 6, 5
 PROJECTORS = {
@@ -580,3 +581,33 @@ def test_with_more_data_it_becomes_the_hard_projection():
         deviations.append(soft.notes["residual_deviation"])
     assert apart[0] > 5 * apart[1] > 5 * apart[2]
     assert deviations[0] > 3 * deviations[1] > 3 * deviations[2]
+
+
+# --- input-output data: the state is not measured, and a pinned past stands for it
+
+
+def test_a_pinned_past_of_inputs_and_outputs_takes_the_place_of_the_state(rng):
+    """Behaviours of y = C x need no state: past and future of (y, u) from a Hankel matrix, the past pinned."""
+    system, C = double_integrator(process_noise=0.0), np.array([[1.0, 0, 0, 0], [0, 1, 0, 0]])
+    past, ahead = 2, 8  # as many steps as the state needs to be seen; the outputs of more would not be independent
+    steps = past + ahead
+    layout = Layout((Channel("y", 2, 0, steps - 1), Channel("u", 2, 0, steps - 1)))
+
+    def recorded(length: int, count: int) -> np.ndarray:
+        u = rng.standard_normal((count, length, 2))
+        x = system.simulate(rng.standard_normal((count, 4)), u)
+        return np.concatenate([x[:, :-1] @ C.T, u], axis=-1)
+
+    seen = windows(recorded(200, 1), steps)[0]
+    columns = layout.pack(y=seen[..., :2], u=seen[..., 2:])
+    basis = np.linalg.svd(columns.T, full_matrices=False)[0][:, : 2 * steps + 4]
+    shown = recorded(steps, 3)
+    tau = layout.pack(y=shown[..., :2], u=shown[..., 2:])
+    entries = np.arange(layout.size)
+    held = np.concatenate([layout.get(entries, name)[:past].ravel() for name in ("y", "u")])
+    moved = layout.get(entries, "y")[past:].ravel()
+    disturbed = tau.copy()
+    disturbed[:, moved] += rng.standard_normal((3, len(moved)))
+    inputs = layout.get(entries, "u")[past:].ravel()
+    P = Span(layout, basis).bind(pins=[Pin(np.concatenate([held, inputs]), tau[:, np.concatenate([held, inputs])])])
+    np.testing.assert_allclose(P(disturbed), tau, atol=1e-9)
