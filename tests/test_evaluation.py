@@ -138,12 +138,12 @@ def test_spread_is_the_trace_of_the_covariance_of_a_cases_plans():
     rng = np.random.default_rng(0)
     deviation, cases = np.array([1.0, 2.0, 0.5]), 400
     planned = rng.standard_normal((cases, 1, 3)) * 100 + rng.standard_normal((cases, 5, 3)) * deviation
-    found = spread(planned, covariance_trace=float((deviation**2).sum())).headline
-    np.testing.assert_allclose(found["spread"], (deviation**2).sum(), rtol=0.1)
-    np.testing.assert_allclose(found["spread_ratio"], 1, rtol=0.1)
-    assert spread(planned).headline == {"spread": found["spread"]}
-    assert spread(planned, covariance_trace=0.0).headline == {"spread": found["spread"]}
-    assert spread(planned[:, :1]).headline == {}
+    found = spread(planned, covariance_trace=float((deviation**2).sum())).per_plan
+    np.testing.assert_allclose(found["spread"].mean(axis=-1), planned.var(axis=-2, ddof=1).sum(axis=-1))
+    np.testing.assert_allclose(found["spread"].mean(), (deviation**2).sum(), rtol=0.1)
+    np.testing.assert_allclose(found["spread_ratio"].mean(), 1, rtol=0.1)
+    assert spread(planned).per_plan.keys() == spread(planned, covariance_trace=0.0).per_plan.keys() == {"spread"}
+    assert spread(planned[:, :1]).per_plan == {}
 
 
 def test_a_violation_is_the_largest_of_a_plan_over_entries_and_time(system, rng):

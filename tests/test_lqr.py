@@ -316,18 +316,6 @@ def test_one_weight_a_state(state_cost):
         LQR(state_cost=state_cost).feedback(double_integrator())
 
 
-@pytest.mark.parametrize("scale", [0.5, 1.0])
-def test_draws_of_the_law_have_its_spread(scale):
-    system, task = double_integrator(), task_for(double_integrator())
-    rng, law = np.random.default_rng(0), task.law(system)
-    cases = task.cases(system, 40, numpy_generator(0, "test"))
-    noise = scale * rng.standard_normal((40, 30, law.noise_map.shape[-1]))
-    plans = cases.reference[:, None] + along(law.noise_map, noise)
-    assert task.score(system, cases, plans, plans).per_plan["spread"].mean() == pytest.approx(scale**2, rel=0.05)
-    single = plans[:, :1]
-    assert "spread" not in task.score(system, cases, single, single).per_plan
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [

@@ -523,7 +523,7 @@ def test_definitions_are_checked():
     for name in names():
         for item in (*load(name).figures, *load(name).tables):
             assert item.collect
-    with pytest.raises(ConfigError, match=r"unknown kind 'pie'; expected against, chain, diffusion"):
+    with pytest.raises(ConfigError, match=r"unknown kind 'pie'; expected against, boundary, chain, diffusion"):
         _ = Item("a", "b", kind="pie").collect
     with pytest.raises(
         ConfigError, match="report item a: missing a required argument: 'rows'; see the options of kind 'matrix'"
@@ -567,3 +567,74 @@ def test_the_json_keeps_its_words_and_has_a_list_of_numbers_on_a_line():
     assert json.loads(text) == {**content, "values": [1.23457, 2, None]}
     assert '"values": [1.23457,2' not in to_json({"values": [1.0, "x"]})
     assert '"values": [1.0,2.0]' in to_json({"values": [1.0, 2.0]})
+
+
+def test_the_boundary_lies_where_a_recording_stops_helping(tmp_path):
+    store = MadeUp(tmp_path, "recordings_made_up")
+    store.run(1.0)
+    for noise in (0.001, 0.05):
+        for length in (100, 300):
+            level = 0.3 if noise * 100 < length / 300 else 3.0
+            store.run(level, projector="hankel_lowrank", enforcement="normalised", recording__length=length,
+                      recording__process_noise=noise)  # fmt: skip
+    store.run(status="failed", reason="refused", projector="hankel", enforcement="normalised", recording__length=100,
+              recording__process_noise=0.001)  # fmt: skip
+    store.sweep()
+    content = build(load("recordings"), Evidence(read_sweeps(tmp_path, [store.name])), [], "")
+    drawn = content.figures[0].content
+    assert (drawn.rows, drawn.columns) == ([0.001, 0.05], [100, 300])
+    (panel,) = drawn.panels
+    ratios = [[round(e.value, 1) for e in row] for row in panel.ratios]
+    assert ratios == [[0.3, 0.3], [3.0, 3.0]]
+    assert drawn.found == "Clearly better than vanilla: Hankel, truncated in 2 of 4"
+    with matplotlib.rc_context(RC):
+        figure = drawn.draw(2)
+    assert [list(line.get_ydata()) for line in figure.axes[0].lines] == [[0.5, 0.5]] * 2
+    assert drawn.notes == ["Hankel HH†: failed: refused"]
+
+
+def test_a_definition_may_be_somebodys_own_file(tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text("title: Mine\ntables:\n  - {id: a, title: b, options: {metrics: [gap], cells: {}}}\n")
+    out = ["--output-dir", str(STORE), "--out", str(tmp_path / "out")]
+    assert cli.main(["lqr_made_up", "--definition", str(path), *out]) == 0
+    assert "<h1>Mine</h1>" in (tmp_path / "out" / "index.html").read_text()
+    with pytest.raises(ConfigError, match="there is no such file"):
+        load(str(tmp_path / "other.yaml"))
+
+
+def test_scores_of_own_tasks_stand_in_the_default_table(tmp_path):
+    store = MadeUp(tmp_path)
+    store.run(1.0, per_plan={"apples": 3.0})
+    store.sweep()
+    table = build(load("default"), Evidence(read_sweeps(tmp_path, [store.name])), [], "").tables[0].content
+    assert table.metrics[-1] == "apples"
+    assert table.rows[0].values["apples"].mean.value > 0
+
+
+def test_where_a_log_lies_is_not_told(tmp_path):
+    store = MadeUp(tmp_path)
+    store.run(status="failed", reason="too short; log: /some/place/of/one/machine.log")
+    store.sweep()
+    (cell,) = read_sweeps(tmp_path, [store.name]).cells
+    assert cell.outcome == "failed: too short"
+
+
+def test_the_command_ends_with_what_was_found_and_compares(tmp_path, capsys):
+    for name, level in (("one", 0.2), ("two", 0.5)):
+        store, size = MadeUp(tmp_path, name, cases=20), {"dataset__train_size": int(100 * level)}
+        store.run(1.0, **size)
+        store.run(level, projector="known", enforcement="normalised", **size)
+        store.sweep()
+    assert cli.main(["one", "--output-dir", str(tmp_path), "--against", "two"]) == 0
+    told = capsys.readouterr().out.splitlines()
+    assert told[0].startswith("Helps: 1 of 1 methods have a state error clearly below that of vanilla")
+    assert any(line.startswith("Against two: ") for line in told)
+    assert any(line.startswith("outside: known FF†, state error") for line in told)
+    assert told[-1].startswith("report: ")
+    folder = tmp_path / "reports" / "one"
+    rows = list(csv.DictReader((folder / "against.csv").open()))
+    assert {row["within"] for row in rows} == {"True", "False"}
+    assert cli.main(["one", "--output-dir", str(tmp_path), "--against", str(folder)]) == 0
+    again = capsys.readouterr().out
+    assert f"Against one: {len(rows)} of {len(rows)} numbers lie within its intervals." in again

@@ -40,14 +40,16 @@ def dynamics_residual(system: System, layout: TrajectoryLayout, tau: np.ndarray)
 def spread(planned: np.ndarray, covariance_trace: float | None = None) -> Scores:
     """How widely the plans of a case scatter: without it an error is half the story, since the mean has the least.
 
-    `spread` is the trace of the sample covariance of a case's plans, averaged; `spread_ratio` is it over that of the
-    law of demonstrations. One plan a case has neither, and an unknown law or one without spread gives no ratio.
+    `spread` is the trace of the sample covariance of a case's plans, given plan by plan as S / (S - 1) times its
+    squared distance from their mean; `spread_ratio` is it over that of the law of demonstrations. One plan a case has
+    neither, and an unknown law or one without spread gives no ratio.
     """
-    if planned.shape[-2] < 2:
+    if (samples := planned.shape[-2]) < 2:
         return Scores()
-    found = {"spread": float(planned.var(axis=-2, ddof=1).sum(axis=-1).mean())}
-    ratio = {"spread_ratio": found["spread"] / covariance_trace} if covariance_trace else {}
-    return Scores(headline=found | ratio)
+    found = _squared(planned - planned.mean(axis=-2, keepdims=True)) * samples / (samples - 1)
+    return Scores(
+        per_plan={"spread": found, **({"spread_ratio": found / covariance_trace} if covariance_trace else {})}
+    )
 
 
 def violations(system: System, layout: TrajectoryLayout, planned: np.ndarray, rollout: np.ndarray) -> Scores:

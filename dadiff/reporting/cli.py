@@ -7,6 +7,7 @@ import logging
 import shlex
 import tempfile
 from pathlib import Path
+from typing import Any
 
 from dadiff.commands import reported
 from dadiff.store import Results, Sweeps
@@ -17,7 +18,13 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="dadiff-report", description="Write the report of stored sweeps.")
     parser.add_argument("sweep", nargs="+", help="name of a sweep, or several to report as one")
     parser.add_argument("--output-dir", type=Path, default=Path("outputs"), help="where results lie (default: outputs)")
-    parser.add_argument("--definition", help="which report to write (default: the one made for the sweep)")
+    parser.add_argument(
+        "--definition", help="which report to write: a name, or a yaml file (default: the one made for the sweep)"
+    )
+    parser.add_argument(
+        "--against",
+        help="another sweep, or the folder of a report: each number within or outside of its interval there",
+    )
     parser.add_argument("--out", type=Path, help="folder to write (default: <output-dir>/reports/<sweep>)")
     parser.add_argument(
         "--publish", type=Path, help="folder to copy numbers, configurations and SVG figures to, for version control"
@@ -33,7 +40,33 @@ def main(arguments: list[str] | None = None) -> int:
     """Write one report; 0 if it was written."""
     logging.basicConfig(format="%(message)s")
     options = _parser().parse_args(arguments)
-    return reported("dadiff-report", lambda: print(f"report: {write(options)}"))
+    return reported("dadiff-report", lambda: print("\n".join(said(write(options), options))))
+
+
+def said(index: Path, options: argparse.Namespace) -> list[str]:
+    """What was found, in the report's own sentences, how it compares, and where it lies."""
+    from dadiff.reporting import published, story
+    from dadiff.reporting.claims import read_ledger
+    from dadiff.reporting.compare import compared
+    from dadiff.reporting.definitions import FOLDER
+
+    content = published.read(index.parent)
+    lines = story.sentences(content, story.ledger(content, read_ledger(FOLDER / "claims.yaml")))
+    if options.against:
+        lines += compared(content, _other(options), index.with_name("against.csv"))
+    return [*lines, f"report: {index}"]
+
+
+def _other(options: argparse.Namespace) -> dict[str, Any]:
+    """The content of the report to compare with: of a folder, else of a sweep, whose report is written."""
+    from dadiff.reporting import published
+
+    if (Path(options.against) / "report.json").is_file():
+        return published.read(Path(options.against))
+    with tempfile.TemporaryDirectory() as folder:
+        asked = {"sweep": [options.against], "out": Path(folder), "publish": None}
+        _write(argparse.Namespace(**{**vars(options), **asked}), options.output_dir)
+        return published.read(Path(folder))
 
 
 def write(options: argparse.Namespace) -> Path:

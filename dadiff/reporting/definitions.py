@@ -15,6 +15,7 @@ import inspect
 import pkgutil
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import yaml
@@ -74,18 +75,21 @@ class Definition:
 
 
 def load(name: str) -> Definition:
-    """The definition of a name.
+    """The definition of a name, or of a yaml file that somebody wrote.
 
     Raises:
         ConfigError: if there is none, or it has unknown or missing keys.
     """
-    path = FOLDER / f"{name}.yaml"
+    own = name.endswith((".yaml", ".yml"))
+    path = Path(name) if own else FOLDER / f"{name}.yaml"
+    if own and not path.is_file():
+        raise ConfigError(f"report definition {name}: there is no such file; give the path of a yaml, or a name")
     if not path.is_file():
         raise ConfigError(f"no report definition {name!r}; found {', '.join(names())} in {FOLDER}")
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
         parts = [[Item(**item) for item in content.pop(kind, [])] for kind in ("figures", "tables")]
-        return Definition(name=name, figures=parts[0], tables=parts[1], **content)
+        return Definition(name=path.stem, figures=parts[0], tables=parts[1], **content)
     except (TypeError, AttributeError, yaml.YAMLError) as error:
         raise ConfigError(f"{path}: {error}; expected the keys of a report definition") from None
 

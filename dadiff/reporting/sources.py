@@ -6,6 +6,7 @@ A cell is `finished`, `diverged`, `failed`, ... as its run says, or `missing` wh
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
@@ -29,6 +30,10 @@ def _table(folder: Path, name: str) -> pd.DataFrame:
 @lru_cache(maxsize=4096)
 def _columns(folder: Path, name: str) -> tuple[str, ...]:
     return tuple(_table(folder, name).columns)
+
+
+LOG = re.compile(r"; log: \S+$")
+"""Where a sweep's cell says more: a place on one machine, which no report names."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +85,8 @@ class Cell:
     @property
     def outcome(self) -> str:
         """The status in words, with step or reason."""
-        reason = (self.record.reason if self.record else None) or self.waiting
+        told = (self.record.reason if self.record else None) or self.waiting
+        reason = told and LOG.sub("", told)
         if self.record and self.status == "diverged" and self.record.diverged_step is not None:
             return f"diverged at step {self.record.diverged_step}"
         return f"{self.status}: {reason}" if reason else self.status
@@ -106,6 +112,10 @@ class Cell:
     def has_column(self, table: str, column: str) -> bool:
         """Whether the run holds this table, and that this column."""
         return self.run is not None and self.run.has(table) and column in _columns(self.run.folder, table)
+
+    def columns(self, table: str) -> tuple[str, ...]:
+        """Of a stored table; empty if the run does not hold it."""
+        return _columns(self.run.folder, table) if self.run is not None and self.run.has(table) else ()
 
     def table(self, name: str) -> pd.DataFrame:
         """The stored table `per_step`, `per_plan` or `chain`.

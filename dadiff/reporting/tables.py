@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from dadiff.outside import spreadsheet_safe
-from dadiff.reporting.aggregation import Evidence, Method, has_metric, pair, varying
-from dadiff.reporting.labels import FLOORS, method_name
+from dadiff.reporting.aggregation import LEVELS, Evidence, Method, has_metric, pair, varying
+from dadiff.reporting.labels import FLOORS, METRICS, method_name
 from dadiff.reporting.selection import Selector
 from dadiff.reporting.statistics import Estimate, difference, mean, ratio
 
@@ -64,13 +64,21 @@ def collect(
     """The methods that `cells` asks for; metrics that none of them has are left out.
 
     Args:
+        metrics: `...` stands for all scores of the task that have no name in print, those of own tasks.
         relative_to: the baseline of ratios and differences.
         group: of a fleet, the robots of this group alone.
     """
     methods = evidence.methods(cells)
+    metrics = [name for asked in metrics for name in (_own(methods) if asked == "..." else [asked])]
     kept = [name for name in metrics if any(m.finished and has_metric(m.finished, name) for m in methods)]
     rows = [_row(evidence, method, kept, varying(methods), relative_to, group) for method in methods]
     return Table(kept, method_name(dict(relative_to)) if relative_to else "", rows)
+
+
+def _own(methods: list[Method]) -> list[str]:
+    """Scores per plan that are not among those of this package."""
+    columns = dict.fromkeys(name for m in methods for cell in m.finished[:1] for name in cell.columns("per_plan"))
+    return [name for name in columns if name not in METRICS and name not in LEVELS]
 
 
 def _row(

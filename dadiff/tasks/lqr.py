@@ -195,10 +195,7 @@ class LQR:
         return self.cost(system).Q, self.cost(system).R
 
     def score(self, system: AffineSystem, cases: Cases, planned: np.ndarray, rollout: np.ndarray) -> Scores:
-        """The cost after replay over that of the noise-free finite-horizon optimum; and how widely plans are spread.
-
-        Spread is the trace of the covariance of a case's plans over that of the law of optimal trajectories, 1 for
-        right samples: each plan's squared distance from their mean, S / (S - 1) times, over the trace.
+        """The cost after replay over that of the noise-free finite-horizon optimum of the case.
 
         Where the system has bounds that optimum may exceed them, and `bounded_cost_ratio` is over the optimum within.
         """
@@ -209,12 +206,4 @@ class LQR:
         if system.bounds.any and self.reference == "mean":
             against["bounded_cost_ratio"] = cases.reference
         ratios = {name: spent / cost(*layout.split(tau), target)[..., None] for name, tau in against.items()}
-        return Scores(per_plan={**ratios, **self._spread(system, planned)})
-
-    def _spread(self, system: AffineSystem, planned: np.ndarray) -> dict[str, np.ndarray]:
-        """Nothing of single plans, and where optimal trajectories have no spread."""
-        samples, trace = planned.shape[-2], np.square(self.law(system).noise_map).sum(axis=(-2, -1))
-        if samples < 2 or not np.all(trace > 0):
-            return {}
-        apart = np.square(planned - planned.mean(axis=-2, keepdims=True)).sum(axis=-1) * samples / (samples - 1)
-        return {"spread": apart / np.expand_dims(trace, (-2, -1))}
+        return Scores(per_plan=ratios)
