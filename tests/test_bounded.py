@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cvxpy
 import numpy as np
 import pytest
 import torch
-from laws import SYSTEMS, Linear, fleet, trajectories
+from laws import SYSTEMS, Linear, exciting, fleet, random_system, trajectories, varying_system
 
-from dadiff.behaviours import Bounded, Dynamics, Known, Pin, pins
+from dadiff.behaviours import Bounded, Dynamics, Identified, IdentifiedSoft, Known, Pin, pins, prediction_error
 from dadiff.behaviours.stages import stages_of
-from dadiff.errors import ShapeError
+from dadiff.errors import NotApplicableError, ShapeError
+from dadiff.systems.nonlinear import Nonlinear
 from dadiff.systems.system import Bounds
 from dadiff.trajectory.coordinates import Coordinates, physical
 from dadiff.trajectory.covariance import Covariance
@@ -122,9 +125,61 @@ def test_where_nothing_is_feasible_it_says_of_how_many_plans():
     assert P.info.residual > 1e-3
 
 
+def random_case(seed: int):
+    """Bounds that bind, estimates, starts and coordinates; from some starts nothing stays within."""
+    rng = np.random.default_rng(seed)
+    n, m, T = int(rng.integers(2, 5)), int(rng.integers(1, 3)), int(rng.integers(4, 13))
+    system = varying_system(n, m, T, seed) if seed % 5 == 0 else random_system(n, m, 0.0, seed)
+    low_x = np.where(rng.random(n) < 0.3, -np.inf, -rng.uniform(1.2, 2.5, n))
+    bounds = Bounds(-rng.uniform(0.2, 1.5, m), rng.uniform(0.2, 1.5, m), low_x, rng.uniform(1.2, 2.5, n))
+    target = Bounded.by(Dynamics(system.layout(T), stages_of(system, T)), bounds)
+    d = target.layout.size
+    where = Coordinates(rng.standard_normal(d), rng.uniform(0.5, 2, d))
+    return target, rng.standard_normal((4, d)), 0.8 * rng.standard_normal((4, n)), where
+
+
+def test_a_hundred_random_plans_agree_with_a_conic_solver_also_where_it_finds_none():
+    infeasible = 0
+    for seed in range(25):
+        target, tau, x_init, where = random_case(seed)
+        P = target.bind(where, [Pin.initial_state(target.layout, x_init)])
+        projected = where.to_physical(P(where.to_scaled(tau)))
+        solved = [nearest(target, aim, start, where.scale**2) for aim, start in zip(tau, x_init, strict=True)]
+        there = np.array([one is not None for one in solved])
+        assert P.info.unconverged == (~there).sum(), seed
+        infeasible += P.info.unconverged
+        expected = np.array([one for one in solved if one is not None]).reshape(-1, target.layout.size)
+        found = projected[there]
+        objective = [np.square((z - tau[there]) / where.scale).sum(axis=-1) for z in (found, expected)]
+        np.testing.assert_allclose(*objective, atol=1e-6)
+        assert np.abs(target.dynamics.stages.residual(target.layout, found)).max(initial=0.0) < 1e-8
+        beyond = np.maximum(target.low - found, found - target.high)[:, target.layout.state_dim :]
+        assert beyond.max(initial=0.0) < 1e-8
+    assert 0 < infeasible < 50
+
+
+def test_learned_dynamics_keep_to_the_systems_bounds(rng):
+    system = replace(random_system(3, 1, 0.0, seed=1), bounds=Bounds(-0.6, 0.6, -1.5, 1.5))
+    projector, layout = Identified(bounds="enforced"), system.layout(HORIZON)
+    assert projector.needs == {"recording", "system"}
+    learned = projector.fit(layout, system, exciting().record(system))
+    known, z = Known(bounds="enforced").fit(layout, system), rng.standard_normal((5, layout.size))
+    np.testing.assert_allclose(learned.bind()(z), known.bind()(z), atol=1e-6)
+    assert prediction_error(learned, system, known.bind()(z))["prediction_error"] < 1e-8
+
+
+def test_bounds_that_cannot_be_held_are_refused(rng):
+    curved = Nonlinear(lambda x, u: x + u, 1, 1, bounds=Bounds(input_high=1.0))
+    with pytest.raises(NotApplicableError, match="linear dynamics only"):
+        Known(bounds="enforced").fit(curved.layout(3), curved)
+    layout = SYSTEMS["paper"].layout(HORIZON)
+    with pytest.raises(NotApplicableError, match="trusted in part"):
+        IdentifiedSoft(bounds="enforced").fit(layout, demonstrations=rng.standard_normal((9, layout.size)))
+
+
 def test_known_takes_the_systems_bounds_where_it_has_any():
     free, limited = Linear(np.eye(2), np.eye(2)), Linear(np.eye(2), np.eye(2), bounds=Bounds(-1.0, 2.0))
-    known, layout = Known("fixed", bounded=True), free.layout(3)
+    known, layout = Known("fixed", bounds="enforced"), free.layout(3)
     assert isinstance(known.fit(layout, free), Dynamics)
     x_init = np.zeros((1, 2))
     plan = known.fit(layout, limited).bind(pins=pins(known, layout, x_init))(np.full((1, layout.size), 5.0))

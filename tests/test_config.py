@@ -53,7 +53,7 @@ def test_a_node_becomes_its_component():
 def test_defaults_written_out_or_left_out_are_the_same():
     short, long = (
         {"_target_": "dadiff.behaviours.Known"},
-        {"_target_": "dadiff.behaviours.Known", "initial_state": "free", "sweeps": 1, "bounded": False},
+        {"_target_": "dadiff.behaviours.Known", "initial_state": "free", "sweeps": 1, "bounds": "ignored"},
     )
     nodes = [assemble({**usual(), "projector": node}).nodes["projector"] for node in (short, long)]
     assert nodes == [long, long]

@@ -98,7 +98,7 @@ class BoxProjection(Projection):
         self._set, self._where, self._pinned = target, where, pinned
         self._shape = (*target.dynamics.robots, target.layout.size)
         self._unbounded = target.dynamics.bind(where, pins)
-        self.info = ProjectionInfo(self._unbounded.info.rank, "blocks")
+        self.info = ProjectionInfo(self._unbounded.info.rank, "bounded")
 
     def __call__(
         self,
@@ -123,7 +123,7 @@ class BoxProjection(Projection):
         found, steps = problem.solve()
         missed = problem.missed(found)
         self.info = ProjectionInfo(
-            self.info.rank, "blocks", steps, float(missed.max()), int((missed > problem.tolerance).sum())
+            self.info.rank, "bounded", steps, float(missed.max()), int((missed > problem.tolerance).sum())
         )
         return where.to_scaled(found.reshape(tau.shape))
 

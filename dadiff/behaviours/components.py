@@ -28,6 +28,7 @@ from dadiff.trajectory.subspace import numerical_rank, rank_tolerance
 
 Given = TypeVar("Given")
 LearnFrom = Literal["recording", "demonstrations", "both"]
+BoundsChoice = Literal["ignored", "enforced"]
 
 NOTHING: frozenset[str] = frozenset()
 SYSTEM, RECORDING = frozenset({"system"}), frozenset({"recording"})
@@ -105,12 +106,12 @@ class Known:
     Args:
         initial_state: `fixed` projects onto the trajectories with x(0) = x_init.
         sweeps: for each projection onto nonlinear dynamics; more than one where a plan is projected once (post hoc).
-        bounded: keep to the system's bounds on states and inputs as well, where it has any.
+        bounds: `enforced` keeps to the system's bounds on states and inputs as well, where it has any.
     """
 
     initial_state: InitialState = "free"
     sweeps: int = 1
-    bounded: bool = False
+    bounds: BoundsChoice = "ignored"
     needs: ClassVar[frozenset[str]] = SYSTEM
 
     def __post_init__(self) -> None:
@@ -131,15 +132,9 @@ class Known:
         """
         system = _required(system, "known", "system")
         notes: dict[str, float] = {"rank": layout.rank}
-        bounded = self.bounded and system.bounds.any
         if not isinstance(system, AffineSystem):
-            if bounded:
-                raise NotApplicableError(
-                    "projector known: bounds are held for linear systems only; use projector.bounded=false"
-                )
-            return Manifold(layout, system, self.sweeps, notes=notes)
-        dynamics = Dynamics(layout, stages_of(system, layout.horizon), notes=notes)
-        return Bounded.by(dynamics, system.bounds) if bounded else dynamics
+            return within(Manifold(layout, system, self.sweeps, notes=notes), self.bounds, system)
+        return within(Dynamics(layout, stages_of(system, layout.horizon), notes=notes), self.bounds, system)
 
 
 @dataclass(frozen=True)
@@ -209,6 +204,7 @@ class Identified:
         features: terms of phi; none for linear dynamics.
         angles: indices of the states whose sines and cosines are features.
         ridge: weight of |Theta|^2 against the squared residuals, features scaled to deviation 1.
+        bounds: `enforced` keeps to the system's bounds on states and inputs as well, where it has any.
     """
 
     initial_state: InitialState = "free"
@@ -217,6 +213,7 @@ class Identified:
     features: Sequence[Term] = ()
     angles: Sequence[int] = ()
     ridge: float = 0.0
+    bounds: BoundsChoice = "ignored"
 
     def __post_init__(self) -> None:
         for name in ("features", "angles"):
@@ -230,9 +227,10 @@ class Identified:
 
     @property
     def needs(self) -> frozenset[str]:
-        """What it learns from, and the system whose offset is known."""
+        """What it learns from, and the system whose offset or bounds are known."""
         sources = {"recording", "demonstrations"} if self.learn_from == "both" else {self.learn_from}
-        return frozenset(sources | ({"system"} if self.offset == "known" else set()))
+        told = self.offset == "known" or self.bounds == "enforced"
+        return frozenset(sources | ({"system"} if told else set()))
 
     def fit(
         self,
@@ -240,15 +238,19 @@ class Identified:
         system: System | None = None,
         recording: Recording | None = None,
         demonstrations: np.ndarray | None = None,
-    ) -> Dynamics | Manifold:
-        """The trajectories of the estimated dynamics."""
+    ) -> Dynamics | Manifold | Bounded:
+        """The trajectories of the estimated dynamics.
+
+        Raises:
+            NotApplicableError: for bounds on nonlinear dynamics.
+        """
         data = transitions(self, layout, system, recording, demonstrations)
         notes: dict[str, float] = {"rank": layout.rank}
         if self.features:
             phi = Features(layout.state_dim, layout.input_dim, self.features, self.angles)
-            return Manifold(layout, regressed(data, phi, self.ridge).system, notes=notes)
+            return within(Manifold(layout, regressed(data, phi, self.ridge).system, notes=notes), self.bounds, system)
         estimate = least_squares(data, self.offset, known_offset(self, system))
-        return Dynamics(layout, estimate.stages(layout.horizon), notes=notes)
+        return within(Dynamics(layout, estimate.stages(layout.horizon), notes=notes), self.bounds, system)
 
 
 @dataclass(frozen=True)
@@ -276,6 +278,11 @@ class IdentifiedSoft(Identified):
         if self.features:
             raise NotApplicableError(
                 "projector identified_soft: what it trusts is linear dynamics; with features use projector=identified"
+            )
+        if self.bounds == "enforced":
+            raise NotApplicableError(
+                "projector identified_soft: dynamics that are trusted in part are not held within bounds; use "
+                "projector=identified"
             )
         shown = _required(demonstrations, "identified_soft", "dataset")
         data = transitions(self, layout, system, recording, demonstrations)
@@ -372,6 +379,24 @@ def transitions(
         states, inputs = layout.split(trajectories)
         found.append(Transitions.of(states.reshape(*robots, *states.shape), inputs.reshape(*robots, *inputs.shape)))
     return found[0] if len(found) == 1 else found[0] + found[1]
+
+
+def within(found: Dynamics | Manifold, bounds: BoundsChoice, system: System | None) -> Dynamics | Manifold | Bounded:
+    """What was found, within the system's bounds if they are enforced and it has any.
+
+    Raises:
+        NotApplicableError: if the dynamics are nonlinear.
+    """
+    if bounds == "ignored":
+        return found
+    limits = _required(system, "with bounds", "system").bounds
+    if not limits.any:
+        return found
+    if isinstance(found, Manifold):
+        raise NotApplicableError(
+            "projector: bounds are held for linear dynamics only, and these are not; use projector.bounds=ignored"
+        )
+    return Bounded.by(found, limits)
 
 
 def known_offset(projector: Identified, system: System | None) -> np.ndarray | None:

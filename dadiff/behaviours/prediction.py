@@ -6,6 +6,7 @@ from typing import Protocol
 
 import numpy as np
 
+from dadiff.behaviours.bounded import Bounded
 from dadiff.behaviours.lifted import Lifted
 from dadiff.behaviours.manifold import Manifold
 from dadiff.behaviours.sets import Dynamics, TrajectorySet
@@ -46,4 +47,5 @@ def _dynamics(learned: TrajectorySet) -> Simulable | None:
         return learned.system
     if isinstance(learned, Lifted):
         return learned
-    return learned.stages if isinstance(learned, Dynamics) else None
+    dynamics = learned.dynamics if isinstance(learned, Bounded) else learned
+    return dynamics.stages if isinstance(dynamics, Dynamics) else None

@@ -18,7 +18,7 @@ from dadiff.errors import ShapeError
 from dadiff.trajectory.arrays import Array, like
 from dadiff.trajectory.covariance import Covariance
 
-Kind = Literal["dense", "blocks", "manifold"]
+Kind = Literal["dense", "blocks", "manifold", "bounded"]
 
 KEPT = 64  # metrics that a projection holds converted, the oldest given up first
 
@@ -29,7 +29,8 @@ class ProjectionInfo:
 
     Args:
         rank: degrees of freedom that are left.
-        kind: `dense` matrices, a recursion over `blocks` in O(T), or sweeps of it along a `manifold`.
+        kind: `dense` matrices, a recursion over `blocks` in O(T), sweeps of it along a
+            `manifold`, or Newton steps with it, `bounded`.
         iterations: of the last call; 1 for a closed form.
         residual: how far the last call's result is from the set, 0 where that is rounding.
         unconverged: plans of the last call that did not reach the set.
