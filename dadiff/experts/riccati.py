@@ -81,44 +81,51 @@ def solve_all(
 
 @compiled
 def _start_from_the_end(Q: Array, Lx: Array, shared: Array, M: Array, M0: Array, P: Array, S: Array, H: Array) -> None:
-    P[:], S[:, 0], S[:, 1:] = Q, Lx, shared
-    H[0, 0], H[0, 1:], H[1:, 0], H[1:, 1:] = 0.0, M0, M0, M
+    n, q = S.shape
+    for a in range(n):
+        S[a, 0] = Lx[a]
+        for b in range(n):
+            P[a, b] = Q[a, b]
+        for c in range(1, q):
+            S[a, c] = shared[a, c - 1]
+    H[0, 0] = 0.0
+    for c in range(1, q):
+        H[0, c] = H[c, 0] = M0[c - 1]
+        for e in range(1, q):
+            H[c, e] = M[c - 1, e - 1]
 
 
 @compiled
 def _step_back(
-    A: Array,
-    B: Array,
-    defect: Array,
-    Q: Array,
-    R: Array,
-    Lx: Array,
-    Lu: Array,
-    shared_x: Array,
-    shared_u: Array,
-    damping: float,
-    P: Array,
-    S: Array,
-    H: Array,
-    K: Array,
-    columns: Array,
-) -> None:
+    A: Array, B: Array, defect: Array, Q: Array, R: Array, Lx: Array, Lu: Array, shared_x: Array, shared_u: Array,
+    damping: float, P: Array, S: Array, H: Array, K: Array, columns: Array,
+) -> None:  # fmt: skip
     """V_{t+1} to V_t, in place; the gain goes to K (m, n), the feedforward of each parameter to columns (m, k+1)."""
+    (n, m), q = B.shape, S.shape[1]
     _shift(P, S, H, defect)
     PA, PB = _times(P, A), _times(P, B)
     Quu, Qux, Qu = _transposed_times(B, PB), _transposed_times(B, PA), _transposed_times(B, S)
-    for a in range(len(Quu)):
+    for a in range(m):
         Quu[a, a] += damping
-    Quu += R
-    Qu[:, 0] += Lu
-    Qu[:, 1:] += shared_u
-    K[:], columns[:] = -Qux, -Qu
+        Qu[a, 0] += Lu[a]
+        for b in range(m):
+            Quu[a, b] += R[a, b]
+        for c in range(1, q):
+            Qu[a, c] += shared_u[a, c - 1]
+        for b in range(n):
+            K[a, b] = -Qux[a, b]
+        for c in range(q):
+            columns[a, c] = -Qu[a, c]
     _cholesky_solve(Quu, K, columns)
     _add_transposed_times(H, Qu, columns)
-    P[:], S[:] = _transposed_times(A, PA), _transposed_times(A, S)
-    P += Q
-    S[:, 0] += Lx
-    S[:, 1:] += shared_x
+    before = _transposed_times(A, S)
+    for a in range(n):
+        for b in range(n):
+            P[a, b] = Q[a, b]
+        S[a, 0] = before[a, 0] + Lx[a]
+        for c in range(1, q):
+            S[a, c] = before[a, c] + shared_x[a, c - 1]
+    _add_transposed_times(P, A, PA)
     _add_transposed_times(P, Qux, K)
     _add_transposed_times(S, Qux, columns)
     _symmetrise(P)
@@ -141,25 +148,52 @@ def _shift(P: Array, S: Array, H: Array, defect: Array) -> None:
 @compiled
 def _choose_start(P: Array, S: Array, H: Array) -> None:
     """Minimise over dx(0) = -P^-1 S zeta, which replaces S."""
-    chosen, none = -S, np.zeros((len(P), 0))
-    _cholesky_solve(P.copy(), chosen, none)
-    _add_transposed_times(H, S, chosen)
-    S[:] = chosen
+    factor, before, none = np.zeros_like(P), np.zeros_like(S), np.zeros((len(P), 0))
+    for a in range(len(P)):
+        for b in range(len(P)):
+            factor[a, b] = P[a, b]
+        for c in range(S.shape[1]):
+            before[a, c], S[a, c] = S[a, c], -S[a, c]
+    _cholesky_solve(factor, S, none)
+    _add_transposed_times(H, before, S)
 
 
 @compiled
 def _choose_parameters(S: Array, H: Array, dx: Array, z: Array, free: bool) -> None:
     """Stationary z: H_zz z = -(H_z1 + S_z' dx(0))."""
     k = len(z)
-    if k == 0:
-        return
-    right = np.empty(k)
+    inner = np.zeros((k, k))
     for c in range(k):
-        right[c] = -H[c + 1, 0]
+        z[c] = -H[c + 1, 0]
+        for e in range(k):
+            inner[c, e] = H[c + 1, e + 1]
         if not free:
             for a in range(len(dx)):
-                right[c] -= S[a, c + 1] * dx[a]
-    z[:] = np.linalg.solve(np.ascontiguousarray(H[1:, 1:]), right)
+                z[c] -= S[a, c + 1] * dx[a]
+    _eliminate(inner, z)
+
+
+@compiled
+def _eliminate(M: Array, v: Array) -> None:
+    """v <- M^-1 v by Gauss's elimination with partial pivoting, M overwritten; M need not be positive."""
+    k = len(v)
+    for c in range(k):
+        pivot = c
+        for a in range(c + 1, k):
+            if abs(M[a, c]) > abs(M[pivot, c]):
+                pivot = a
+        v[c], v[pivot] = v[pivot], v[c]
+        for e in range(k):
+            M[c, e], M[pivot, e] = M[pivot, e], M[c, e]
+        for a in range(c + 1, k):
+            share = M[a, c] / M[c, c]
+            v[a] -= share * v[c]
+            for e in range(c + 1, k):
+                M[a, e] -= share * M[c, e]
+    for c in range(k - 1, -1, -1):
+        for e in range(c + 1, k):
+            v[c] -= M[c, e] * v[e]
+        v[c] /= M[c, c]
 
 
 @compiled
