@@ -8,11 +8,12 @@ from rich.console import Console
 from rich.table import Table
 
 
-def plain_table(*titles: str) -> Table:
-    """A table without rules, whose first column gives way last."""
+def plain_table(first: str, *titles: str) -> Table:
+    """A table without rules, whose first column gives way where the terminal is narrow."""
     table = Table(box=None, pad_edge=False, header_style="")
+    table.add_column(first, overflow="fold", min_width=16)
     for title in titles:
-        table.add_column(title, overflow="fold", min_width=20 if title == titles[0] and len(titles) > 1 else None)
+        table.add_column(title, min_width=max(map(len, title.split())))
     return table
 
 

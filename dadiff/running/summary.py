@@ -20,6 +20,7 @@ METRICS = {
     "of the law's": "spread_ratio",
     "calls": "network_calls",
     "seconds": "sampling_seconds",
+    "seconds for one plan": "plan_latency",
 }
 COLUMNS = ("cost ratio", "state error", "replayed", "plan-replay gap", "seconds")
 """Of several runs, which are sorted by the first of these that they have."""
