@@ -196,7 +196,6 @@ def test_what_is_no_name_becomes_no_path(form, text):
 def test_no_part_of_the_store_takes_a_path_for_a_name(tmp_path, text):
     for use in (
         Results(tmp_path).folder,
-        Results(tmp_path).is_working,
         Sweeps(tmp_path).folder,
         lambda name: Cache(tmp_path).folder("denoiser", name),
         lambda name: Cache(tmp_path).folder(name, KEYS[0]),

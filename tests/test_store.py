@@ -203,16 +203,16 @@ def test_fields_that_a_newer_version_adds_are_left_aside(tmp_path):
 
 def test_claims_end_with_their_process(tmp_path):
     results = Results(tmp_path)
-    assert not results.is_working(KEY)
+    assert KEY not in results.working_keys()
     with results.working(KEY):
         assert run_process(exit_with, tmp_path) == 1
     assert run_process(exit_with, tmp_path) == 0
     run_process(claim_and_die, tmp_path)
-    assert not results.is_working(KEY)
+    assert KEY not in results.working_keys()
 
 
 def exit_with(root: Path) -> None:
-    raise SystemExit(int(Results(root).is_working(KEY)))
+    raise SystemExit(int(KEY in Results(root).working_keys()))
 
 
 def claim_and_die(root: Path) -> None:

@@ -227,10 +227,6 @@ class Results:
         """Claim the run while working on it; a second process that wants it waits, then finds it done."""
         return locked(self._lock_file(key), f"run {key}")
 
-    def is_working(self, key: str) -> bool:
-        """Whether a living process works on the run."""
-        return is_locked(self._lock_file(key))
-
     def working_keys(self) -> list[str]:
         """The runs that living processes work on."""
         return [lock.stem for lock in sorted(self.root.glob(".locks/*.lock")) if is_locked(lock)]
