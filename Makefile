@@ -4,14 +4,15 @@ RUN := .venv/bin
 OUTPUTS ?= outputs
 export MLFLOW_DISABLE_TELEMETRY := true
 
-.PHONY: help install report test slow lint bench clean
+.PHONY: help install report test slow lint bench mutants clean
 
 help:
 	@echo "make report   quick comparisons on both tasks, and their reports"
 	@echo "make test     the default test suite"
 	@echo "make slow     the tests that take long"
 	@echo "make lint     ruff and mypy"
-	@echo "make bench    the speed measurements of the README"
+	@echo "make bench    speed, beside peers and floors from the same run"
+	@echo "make mutants  faults put into the core, which the tests must find; a quarter of an hour"
 
 install: .venv/installed
 
@@ -50,6 +51,9 @@ lint: .venv/checks
 
 bench: .venv/checks
 	$(RUN)/python -m bench
+
+mutants: .venv/checks
+	$(RUN)/python tools/mutants.py
 
 clean:
 	rm -rf .venv

@@ -128,6 +128,15 @@ def test_the_last_step_adds_the_noise_of_beta_1_only_if_it_is_asked_to():
     assert DDPM().steps(schedule)[:-1] == DDPM(last_step_noise=False).steps(schedule)[:-1]
 
 
+@every_schedule
+@pytest.mark.parametrize("make", [DDIM, DPMSolver])
+def test_noise_is_proportional_to_eta(schedule, make):
+    """sigma = eta times the posterior's deviation, so that eta = 1/2 has half of it and not its root."""
+    for half, whole in zip(make(9, eta=0.5).steps(schedule), make(9, eta=1.0).steps(schedule), strict=True):
+        np.testing.assert_allclose(half.noise, 0.5 * whole.noise, atol=1e-15)
+    assert any(step.noise > 0.1 for step in make(9, eta=1.0).steps(schedule))
+
+
 @given(st.integers(1, 300), st.integers(1, 400), st.floats(0, 1))
 def test_ddim_takes_as_many_steps_as_asked_and_there_are(L, count, eta):
     steps = DDIM(count, eta).steps(paper_linear(L, 1 / L))

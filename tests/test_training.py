@@ -12,7 +12,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from dadiff.denoisers import MLP, EncoderDecoder
+from dadiff.denoisers import MLP, EncoderDecoder, learning
 from dadiff.denoisers.checkpoints import load
 from dadiff.denoisers.learning import Data, train
 from dadiff.denoisers.recipes import Recipe
@@ -278,3 +278,34 @@ def test_rounded_products_learn_as_well(recipe, tmp_path):
         denoiser = run(tmp_path / precision, recipe, replace(training, precision=precision))
         errors[precision] = float((denoiser(noise, SCHEDULE.num_steps, E) - tau).square().mean())
     assert errors["bfloat16"] < 1.25 * errors["float32"]
+
+
+def test_every_step_is_drawn_and_none_beyond():
+    """i is uniform on 1..L, both ends included: the chain begins at L."""
+    training = replace(SHORT, batch_size=4000)
+    data = Data(*demonstrations(), 5, training, "cpu", None)
+    counts = np.bincount(data.draw()[2], minlength=6)
+    assert counts[0] == 0
+    assert len(counts) == 6
+    assert (np.abs(counts[1:] / 4000 - 1 / 5) < 0.03).all()
+
+
+def test_what_a_training_gives_is_the_running_mean_of_its_weights(tmp_path, monkeypatch):
+    """m <- d m + (1 - d) w after each step, from the initial weights on."""
+    seen = []
+
+    class Watched(learning.State):
+        def advance(self, objective, data):
+            before = [m.clone() for m in self.running_mean]
+            super().advance(objective, data)
+            keep = SHORT.ema_decay_at(self.step - 1)
+            for m, old, w in zip(self.running_mean, before, self.weights, strict=True):
+                np.testing.assert_allclose(m, keep * old + (1 - keep) * w.detach(), atol=1e-6)
+            seen.append([w.detach().clone() for w in self.weights])
+            seen.append([m.clone() for m in self.running_mean])
+
+    monkeypatch.setattr(learning, "State", Watched)
+    given = list(run(tmp_path).parameters())
+    *_, last, mean = seen
+    assert all(torch.equal(a, b) for a, b in zip(given, mean, strict=True))
+    assert not all(torch.allclose(a, b, atol=1e-4) for a, b in zip(given, last, strict=True))

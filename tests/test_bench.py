@@ -1,0 +1,56 @@
+"""The table of `make bench`: ratios and exponents are what their names say; nothing here is timed."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+
+import numpy as np
+import pytest
+
+from bench.peers import ConvolutionNetwork, ancestral_chain
+from bench.rows import Row, least
+from bench.show import draw, slope, table
+from dadiff.diffusion.schedule import paper_linear
+from dadiff.trajectory import TrajectoryLayout
+
+ROWS = [
+    Row("a step", 2.0, "ms", "a slower one", 6.0),
+    Row("growing", 8.0, "s", points=[(1.0, 1.0), (2.0, 4.0), (4.0, 16.0)]),
+]
+
+
+def test_a_ratio_says_how_many_times_faster_ours_is():
+    assert ROWS[0].ratio == 3.0
+    assert ROWS[1].ratio is None
+
+
+def test_the_slope_is_the_exponent():
+    assert slope(ROWS[0]) is None
+    np.testing.assert_allclose(slope(ROWS[1]), 2.0)
+
+
+def test_table_figure_and_file_hold_every_row(tmp_path):
+    shown = table(ROWS)
+    assert "3.00" in shown
+    assert "exponent 2.00" in shown
+    assert Row(**json.loads(json.dumps(asdict(ROWS[0])))) == ROWS[0]
+    draw(ROWS, tmp_path / "bench.svg")
+    assert (tmp_path / "bench.svg").read_text().count("a slower one") >= 1
+
+
+def test_least_takes_actions_in_turn():
+    seen = []
+    assert len(least(lambda: seen.append("a"), lambda: seen.append("b"), repeats=2)) == 2
+    assert seen == ["a", "b", "a", "b"]
+
+
+def test_the_reference_chain_projects_as_the_papers_does():
+    """At the last step beta_0 = 0, so what comes out of a whole chain lies in the image."""
+    torch = pytest.importorskip("torch")
+    layout, schedule = TrajectoryLayout(2, 1, 4), paper_linear(20, 1 / 20)
+    basis = torch.linalg.qr(torch.randn(layout.size, 6, generator=torch.Generator().manual_seed(0)))[0]
+    network = ConvolutionNetwork(layout, 3, channels=8, latent=4)
+    tau = ancestral_chain(network, schedule, basis @ basis.T, torch.zeros(5, 3), 20)
+    assert tau.shape == (5, layout.size)
+    np.testing.assert_allclose(tau @ basis @ basis.T, tau, atol=1e-4)
