@@ -14,6 +14,7 @@ from dadiff.behaviours import (
     Hankel,
     HankelLowRank,
     Identified,
+    IdentifiedFamily,
     IdentifiedSoft,
     Inpainting,
     Known,
@@ -39,10 +40,10 @@ from dadiff.trajectory.covariance import Covariance
 from dadiff.trajectory.hankel import identity_length, minimum_length, windows
 
 HORIZON, PLANS = 6, 5
-PROJECTORS = {
+PROJECTORS = {  # what is believed of a family is no projection; see test_family.py
     name: projector
     for name, projector in variants("projector", {"initial_state": ("free", "fixed")}).items()
-    if not isinstance(projector, NoProjector | Inpainting)
+    if not isinstance(projector, NoProjector | Inpainting | IdentifiedFamily)
 }
 ORTHOGONAL = {name: p for name, p in PROJECTORS.items() if not isinstance(p, RolloutProjector)}
 HOLDING = {name: p for name, p in PROJECTORS.items() if p.initial_state == "fixed"}

@@ -14,6 +14,7 @@ from dadiff.behaviours.components import (
     RolloutProjector,
     pins,
 )
+from dadiff.behaviours.family import IdentifiedFamily
 from dadiff.behaviours.least_squares import Estimate, Transitions, least_squares
 from dadiff.behaviours.lifted import Lifted
 from dadiff.behaviours.manifold import Manifold
@@ -31,6 +32,7 @@ __all__ = [
     "Hankel",
     "HankelLowRank",
     "Identified",
+    "IdentifiedFamily",
     "IdentifiedSoft",
     "Inpainting",
     "Known",

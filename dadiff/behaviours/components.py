@@ -374,7 +374,7 @@ def transitions(
         if robots not in ((), (1,)):
             raise ConfigError(
                 f"projector: the demonstrations are of many robots, and say nothing of any one of the {robots[0]} that "
-                "are planned for; use projector.learn_from=recording"
+                "are planned for alone; use projector=identified_family, or projector.learn_from=recording"
             )
         states, inputs = layout.split(trajectories)
         found.append(Transitions.of(states.reshape(*robots, *states.shape), inputs.reshape(*robots, *inputs.shape)))

@@ -13,6 +13,10 @@ PROJECTORS = {
     "hankel": "Hankel HH†",
     "hankel_lowrank": "Hankel, truncated",
     "identified": "identified (A, B)",
+    "identified_soft": "identified, trusted by direction",
+    "identified_family": "identified within its family",
+    "known_bounded": "known, within bounds",
+    "inpainting": "x(0) alone",
     "rollout": "roll-out",
 }
 ENFORCEMENTS = {

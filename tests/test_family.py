@@ -1,0 +1,118 @@
+"""A family as prior knowledge: what demonstrations of many robots say of one that is hardly recorded."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from dadiff.behaviours import IdentifiedFamily, Transitions, compared, least_squares
+from dadiff.behaviours.family import Belief, Moments, posterior, prior
+from dadiff.behaviours.sets import Dynamics
+from dadiff.behaviours.stages import stages_of
+from dadiff.errors import ConfigError
+from dadiff.systems import DampedIntegrators, GaussianExcitation, Recording
+from dadiff.tasks import Fleet
+
+FAMILY = DampedIntegrators()
+TASK = Fleet(horizon=12, robots=150, interpolation=6, extrapolation=2)
+ROBOTS = TASK.target(FAMILY)
+LAYOUT = ROBOTS.layout(12)
+
+
+@cache
+def shown() -> np.ndarray:
+    return TASK.demonstrations(FAMILY, 4, np.random.default_rng(0)).trajectories
+
+
+@cache
+def usual() -> Belief:
+    return prior(LAYOUT, shown())
+
+
+def parameters(robots) -> np.ndarray:
+    """theta = [A B]' of each robot, row by row."""
+    return np.concatenate([robots.A, robots.B], axis=-1).swapaxes(-1, -2).reshape(len(robots.A), -1)
+
+
+def recording(length: int, noise: float = 0.05, seed: int = 0) -> Recording:
+    return GaussianExcitation(length=length, process_noise=noise, seed=seed).record(ROBOTS)
+
+
+def test_the_family_is_found_in_its_demonstrations():
+    many = parameters(FAMILY.inside(4000, np.random.default_rng(1)))
+    deviation, varies = np.sqrt(np.diag(usual().covariance)), many.std(axis=0) > 1e-9
+    np.testing.assert_allclose(usual().mean, many.mean(axis=0), atol=0.02)
+    np.testing.assert_allclose(deviation[varies], many.std(axis=0)[varies], rtol=0.2)
+    assert deviation[~varies].max() < 0.1 * deviation[varies].min()
+    np.testing.assert_allclose(np.sqrt(usual().noise), FAMILY.process_noise, rtol=0.05)
+
+
+@pytest.mark.parametrize(("length", "better"), [(100, 3), (30, 5)])
+def test_a_robot_is_known_much_better_than_by_its_recording_alone(length, better):
+    data = Transitions.of(recording(length).states, recording(length).inputs)
+    alone = least_squares(data)
+    found = posterior(usual(), Moments.of(data))
+    true, inside = parameters(ROBOTS), slice(0, 6)
+    by_recording = np.concatenate([alone.A, alone.B], axis=-1).swapaxes(-1, -2).reshape(len(true), -1)
+    errors = [np.linalg.norm(estimate - true, axis=-1) for estimate in (by_recording, found.mean)]
+    assert errors[0][inside].mean() > better * errors[1][inside].mean()
+    assert errors[0].mean() > better * errors[1].mean(), "outside of the ranges, too"
+    np.testing.assert_allclose(np.sqrt(found.noise).mean(), 0.05, rtol=0.15)
+
+
+def test_without_data_the_family_is_believed_and_with_much_the_data_are():
+    nothing = Moments(np.zeros((6, 6)), np.zeros((6, 4)), np.zeros(4), 1)
+    believed = usual().given(nothing, usual().noise)
+    np.testing.assert_allclose(believed.mean, usual().mean, atol=1e-9)
+    np.testing.assert_allclose(believed.covariance, usual().covariance, atol=1e-9)
+    far = Belief(usual().mean + 1.0, usual().covariance + np.eye(24), usual().noise)
+    found = posterior(far, Moments.of(Transitions.of(recording(5000, 0.01).states, recording(5000, 0.01).inputs)))
+    np.testing.assert_allclose(found.mean, parameters(ROBOTS), atol=0.01)
+
+
+def test_the_true_parameters_lie_as_far_off_as_is_stated():
+    """Over robots of the family, the squared distance in the posterior covariance is the number of parameters."""
+    robots = FAMILY.inside(60, np.random.default_rng(3))
+    made = GaussianExcitation(length=60, process_noise=0.05).record(robots)
+    found = posterior(usual(), Moments.of(Transitions.of(made.states, made.inputs)))
+    off = parameters(robots) - found.mean
+    varies = np.flatnonzero(parameters(robots).std(axis=0) > 1e-9)
+    part = found.covariance[:, varies][:, :, varies]
+    distance = (off[:, varies] * np.linalg.solve(part, off[:, varies, None])[..., 0]).sum(-1)
+    assert 0.5 < np.mean(distance) / len(varies) < 1.5
+
+
+def test_a_fleet_is_its_robots_one_by_one_and_the_set_is_near_the_truth():
+    rec = recording(30)
+    together = IdentifiedFamily().fit(LAYOUT, ROBOTS, rec, shown())
+    one = IdentifiedFamily().fit(LAYOUT, None, Recording(rec.states[2], rec.inputs[2]), shown())
+    np.testing.assert_allclose(together.stages.A[2], one.stages.A, atol=1e-9)
+    np.testing.assert_allclose(
+        together.spread[2] @ together.spread[2].T, one.spread @ one.spread.T, atol=1e-9 * np.square(one.spread).max()
+    )
+    truth = Dynamics(LAYOUT, stages_of(ROBOTS, 12))
+    data = Transitions.of(rec.states, rec.inputs)
+    alone = Dynamics(LAYOUT, least_squares(data).stages(12))
+    assert compared(alone, truth)["projector_distance"] > 3 * compared(together, truth)["projector_distance"]
+
+
+def test_a_recording_of_a_few_steps_is_of_use():
+    few, truth = recording(3), Dynamics(LAYOUT, stages_of(ROBOTS, 12))
+    learned = IdentifiedFamily().fit(LAYOUT, ROBOTS, few, shown())
+    none = Dynamics(LAYOUT, usual().stages(LAYOUT))
+    assert compared(learned, truth)["projector_distance"] < compared(none, truth)["projector_distance"]
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.05])
+def test_it_needs_both_and_says_so(noise):
+    assert np.isfinite(IdentifiedFamily().fit(LAYOUT, ROBOTS, recording(60, noise), shown()).spread).all()
+    with pytest.raises(ConfigError, match="needs a recording"):
+        IdentifiedFamily().fit(LAYOUT, demonstrations=shown())
+    with pytest.raises(ConfigError, match="needs a dataset"):
+        IdentifiedFamily().fit(LAYOUT, recording=recording(60))
+    with pytest.raises(ConfigError, match="inflation is 0"):
+        IdentifiedFamily(inflation=0.0)
+    with pytest.raises(ConfigError, match="the demonstrations of many robots"):
+        prior(LAYOUT, shown()[:1])
