@@ -84,9 +84,9 @@ def test_a_plan_has_each_key_once_and_builds_what_is_shared_first(tmp_path):
     assert plan.preparations[1].needs == {demonstrations}
     assert plan.needs(plan.cells[0]) == {demonstrations, denoiser, cases}
     text = describe(plan)
-    assert "4 cells, 0 done, 4 to run" in text
-    assert "(2 cells of the sweep)" in text
-    assert f"denoiser {denoiser} is shared by 4 cells" in text
+    assert "4 runs, 0 done, 4 to run" in text
+    assert "(2 times in the sweep)" in text
+    assert f"denoiser {denoiser} is shared by 4 runs" in text
     assert f"would train denoiser {denoiser}" in text
 
 

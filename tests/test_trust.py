@@ -134,11 +134,11 @@ def test_mistakes_that_hydra_finds_are_told_in_one_line(mistake, told):
 @pytest.mark.parametrize(
     ("given", "told"),
     [
-        (["seed=range(0,100000)"], "100,000 cells"),
-        (["seed=range(0,1000000000000)", "projector=none,known"], "2,000,000,000,000 cells"),
+        (["seed=range(0,100000)"], "100,000 runs"),
+        (["seed=range(0,1000000000000)", "projector=none,known"], "2,000,000,000,000 runs"),
         (["seed=range(5,1)"], "seed: ranges over nothing"),
         (["seed=range(0,5,0)"], "seed: ranges over nothing"),
-        (["output_dir=a,b"], "output_dir: the cells of a sweep share one output folder"),
+        (["output_dir=a,b"], "output_dir: the runs of a sweep share one output folder"),
     ],
 )
 def test_the_cells_of_a_sweep_are_counted_before_they_are_made(given, told):

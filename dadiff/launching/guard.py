@@ -238,13 +238,13 @@ def check_sweep(config: DictConfig, overrides: Sequence[str]) -> None:
     parsed = _sweep_of(config, overrides)
     counts = {override.key_or_group: _count(override) for override in parsed if override.is_sweep_override()}
     if "output_dir" in counts:
-        raise ConfigError("output_dir: the cells of a sweep share one output folder; give one")
+        raise ConfigError("output_dir: the runs of a sweep share one output folder; give one")
     if empty := [name for name, count in counts.items() if not count]:
-        raise ConfigError(f"{empty[0]}: ranges over nothing, so that the sweep has no cells")
+        raise ConfigError(f"{empty[0]}: ranges over nothing, so that the sweep has no runs")
     if (cells := math.prod(counts.values())) > MOST_CELLS:
         over = " x ".join(f"{count:,} {name}" for name, count in counts.items())
         raise ConfigError(
-            f"a sweep of {cells:,} cells ({over}); at most {MOST_CELLS:,} are taken: split it, or ask for fewer"
+            f"a sweep of {cells:,} runs ({over}); at most {MOST_CELLS:,} are taken: split it, or ask for fewer"
         )
 
 

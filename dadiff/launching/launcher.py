@@ -91,7 +91,7 @@ class SweepLauncher(Launcher):
         watch = Watch(run, parent, Table(sys.stderr, len(works), skipped))
         interrupted = False
         if skipped:
-            sys.stderr.write(f"{skipped} of {len(run.plan.cells)} cells are done already: skipped\n")
+            sys.stderr.write(_said_of_done(skipped, len(run.plan.cells)))
         try:
             if pool is not None:
                 with _terminated_as_interrupt():
@@ -103,6 +103,12 @@ class SweepLauncher(Launcher):
         sys.stdout.write(f"{several_runs(run.stored(sweep))}\n")
         sys.stderr.write(f"{summary(sweep, skipped, run.folder)}\n{run.tracking.how_to_look(run.name)}\n")
         return 130 if interrupted else int(any(cell.status not in DONE for cell in sweep.cells))
+
+
+def _said_of_done(done: int, total: int) -> str:
+    if done == total:
+        return f"all {total} runs are done already (force=true makes them anew)\n"
+    return f"{done} of {total} runs are done already: skipped\n"
 
 
 class Watch:

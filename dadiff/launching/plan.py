@@ -120,10 +120,10 @@ def _keys(identity: Identity) -> set[str]:
 
 def describe(plan: Plan) -> str:
     """The plan for people: cells with their keys and state, what they share, what would be built."""
-    lines = [f"{len(plan.cells)} cells, {len(plan.cells) - len(plan.waiting)} done, {len(plan.waiting)} to run"]
+    lines = [f"{len(plan.cells)} runs, {len(plan.cells) - len(plan.waiting)} done, {len(plan.waiting)} to run"]
     lines += [f"  {cell.identity.key}  {_state(cell):<8}  {cell.identity.name}{_copies(cell)}" for cell in plan.cells]
     trainings = Counter(cell.identity.denoiser.key for cell in plan.cells if cell.identity.denoiser)
-    lines += [f"denoiser {key} is shared by {count} cells" for key, count in trainings.items() if count > 1]
+    lines += [f"denoiser {key} is shared by {count} runs" for key, count in trainings.items() if count > 1]
     lines += [f"would {preparation.name}" for preparation in plan.preparations]
     return "\n".join(lines)
 
@@ -133,4 +133,4 @@ def _state(cell: PlannedCell) -> str:
 
 
 def _copies(cell: PlannedCell) -> str:
-    return f"  ({cell.copies} cells of the sweep)" if cell.copies > 1 else ""
+    return f"  ({cell.copies} times in the sweep)" if cell.copies > 1 else ""

@@ -129,7 +129,7 @@ def summary(sweep: Sweep, skipped: int, folder: Path) -> str:
     """A sweep's end in a few lines: how many cells ended how, and what failed why."""
     counts = Counter(cell.status for cell in sweep.cells)
     ended = ", ".join(f"{count} {status}" for status, count in counts.most_common())
-    lines = [f"{sweep.name}: {len(sweep.cells)} cells: {ended}" + (f" ({skipped} were done before)" if skipped else "")]
+    lines = [f"{sweep.name}: {len(sweep.cells)} runs: {ended}" + (f" ({skipped} were done before)" if skipped else "")]
     lines += [f"  {cell.status}: {cell.name}: {cell.reason}" for cell in sweep.cells if cell.reason]
     if any(cell.status not in DONE for cell in sweep.cells):
         lines.append(f"the same command resumes it, leaving alone what is done: {sweep.command}")

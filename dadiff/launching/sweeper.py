@@ -24,5 +24,5 @@ class CellSweeper(BasicSweeper):
         overrides = parser.parse_overrides([*self._parse_config(), *arguments])
         batches = self.split_arguments(overrides, self.max_batch_size)
         if not batches[0]:
-            raise ConfigError("the sweep has no cells: one of its parameters ranges over nothing")
+            raise ConfigError("the sweep has no runs: one of its parameters ranges over nothing")
         return [self.launcher.launch(batch, initial_job_idx=0) for batch in batches]
