@@ -1,6 +1,7 @@
 """Behaviours: the sets of admissible trajectories, what they are learned from, and the projections onto them."""
 
 from dadiff.behaviours.bounded import Bounded
+from dadiff.behaviours.clear import Clear
 from dadiff.behaviours.components import (
     Hankel,
     HankelLowRank,
@@ -8,6 +9,7 @@ from dadiff.behaviours.components import (
     IdentifiedSoft,
     Inpainting,
     Known,
+    KnownClear,
     Koopman,
     NoProjector,
     Projector,
@@ -26,6 +28,7 @@ from dadiff.behaviours.stages import Stages
 
 __all__ = [
     "Bounded",
+    "Clear",
     "Dynamics",
     "Estimate",
     "Everything",
@@ -36,6 +39,7 @@ __all__ = [
     "IdentifiedSoft",
     "Inpainting",
     "Known",
+    "KnownClear",
     "Koopman",
     "Lifted",
     "Manifold",

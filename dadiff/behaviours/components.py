@@ -13,6 +13,7 @@ from typing import ClassVar, Literal, Protocol, TypeVar
 import numpy as np
 
 from dadiff.behaviours.bounded import Bounded
+from dadiff.behaviours.clear import Clear
 from dadiff.behaviours.least_squares import Offset, Transitions, least_squares, lifted, regressed
 from dadiff.behaviours.lifted import Lifted
 from dadiff.behaviours.manifold import Manifold
@@ -135,6 +136,43 @@ class Known:
         if not isinstance(system, AffineSystem):
             return within(Manifold(layout, system, self.sweeps, notes=notes), self.bounds, system)
         return within(Dynamics(layout, stages_of(system, layout.horizon), notes=notes), self.bounds, system)
+
+
+@dataclass(frozen=True)
+class KnownClear:
+    """Known linear dynamics among discs: keeps clear of the obstacles of E as well.
+
+    Args:
+        initial_state: as of `Known`.
+        margin: by which discs are inflated, in metres.
+        rounds: how often discs become half-planes about what was found.
+    """
+
+    initial_state: InitialState = "fixed"
+    margin: float = 0.03
+    rounds: int = 2
+    needs: ClassVar[frozenset[str]] = SYSTEM
+
+    def __post_init__(self) -> None:
+        if self.margin < 0 or self.rounds < 1:
+            raise ConfigError(f"projector: margin is {self.margin} and rounds {self.rounds}; need >= 0 and >= 1")
+
+    def fit(
+        self,
+        layout: TrajectoryLayout,
+        system: System | None = None,
+        recording: Recording | None = None,
+        demonstrations: np.ndarray | None = None,
+    ) -> Clear:
+        """The trajectories of the system, before it is told of discs.
+
+        Raises:
+            NotApplicableError: for nonlinear systems.
+        """
+        dynamics = Known().fit(layout, system)
+        if not isinstance(dynamics, Dynamics):
+            raise NotApplicableError("projector known_clear: it keeps linear systems clear; use projector=known")
+        return Clear(dynamics, self.margin, self.rounds)
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 import torch
 
-from dadiff.behaviours import Pin, Projection, TrajectorySet
+from dadiff.behaviours import Clear, Pin, Projection, TrajectorySet
 from dadiff.diffusion.chain import Observe, Samples, Start, sample
 from dadiff.diffusion.context import Project
 from dadiff.diffusion.enforcement import Enforcement
@@ -146,7 +146,8 @@ class Planner:
         if self.behaviour is None or self.enforcement is None:
             return None
         start = (Pin.initial_state(self.layout, self.condition.get(E, "x_init")),) if self.starts_fixed else ()
-        projection = self.behaviour.bind(self.coordinates, (*start, *pins), self.device)
+        behaviour = self.behaviour.among(self.condition, E) if isinstance(self.behaviour, Clear) else self.behaviour
+        projection = behaviour.bind(self.coordinates, (*start, *pins), self.device)
         if not self.enforcement.affine and projection.affine:
             raise NotApplicableError(
                 "enforcement: literal scales the sample, which is meaningless for an affine set (x(0) held, or "
