@@ -49,7 +49,7 @@ class Chain:
                     trace.steps, trace.values[name], lw=1.2, ls=look.line, label=trace.label, markevery=0.12, ms=4,
                     **look.points,
                 )  # fmt: skip
-                tag(trace.label, line, values=True)
+                tag(trace.label, line)
             ax.set_xscale("symlog", linthresh=10)  # most happens in the last steps
             ax.set_xticks([0, 5, 10, 100, 1000], ["0", "5", "10", "100", "1000"])
             ax.set_xlim(max(trace.steps.max() for trace in self.traces), -0.5)

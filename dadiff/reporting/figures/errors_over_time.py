@@ -75,7 +75,7 @@ class ErrorsOverTime:
             return ""
         best, worst = min(means, key=means.__getitem__), max(means, key=means.__getitem__)
         name, where = metric_name(self.panels[0].metric).split(" ‖")[0], self.panels[0].condition
-        told = f"Lowest {name}{f', {where},' if where else ''}: {best}"
+        told = f"Lowest {name}{f' {where}' if where else ''}: {best}"
         told += f", {number(means[best] / means[vanilla], 2)} × {vanilla}" if best != vanilla else ""
         return told + (f"; highest: {worst}, {number(means[worst] / means[vanilla], 2)} ×" if worst != vanilla else "")
 

@@ -76,7 +76,6 @@ RC: dict[Any, Any] = {
     "text.parse_math": False,
     "lines.linewidth": 1.6,
     "lines.markersize": 5.0,
-    "path.simplify": False,
 }
 
 
@@ -165,9 +164,10 @@ def label_ends(ax: Axes, ends: Sequence[tuple[str, float, str]]) -> None:
     low, high = (math.log10(y) for y in ax.get_ylim())
     ordered = sorted(ends, key=lambda end: end[1])
     places = _apart([(math.log10(y) - low) / (high - low) for _, y, _ in ordered], LABEL_GAP)
-    look: dict[str, Any] = {"transform": ax.transAxes, "fontsize": 7, "va": "center", "clip_on": False}
+    look: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points", "fontsize": 7, "va": "center"}
     for (label, _, colour), place in zip(ordered, places, strict=True):
-        tag(label, ax.text(1.015, place, "■", color=colour, **look), ax.text(1.055, place, label, **look))
+        square = ax.annotate("■", (1, place), (3, 0), color=colour, **look)
+        tag(label, square, ax.annotate(label, (1, place), (12, 0), **look))
 
 
 MOST_LABELS, LABEL_GAP = 6, 0.075
