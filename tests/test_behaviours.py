@@ -18,6 +18,7 @@ from dadiff.behaviours import (
     IdentifiedSoft,
     Inpainting,
     Known,
+    KnownClear,
     Koopman,
     NoProjector,
     Pin,
@@ -45,7 +46,7 @@ PROJECTORS = {  # what is believed of a family is no projection; see test_family
     for name, projector in variants("projector", {"initial_state": ("free", "fixed")}).items()
     if not isinstance(projector, NoProjector | Inpainting | IdentifiedFamily)
 }
-ORTHOGONAL = {name: p for name, p in PROJECTORS.items() if not isinstance(p, RolloutProjector)}
+ORTHOGONAL = {name: p for name, p in PROJECTORS.items() if not isinstance(p, RolloutProjector | KnownClear)}
 HOLDING = {name: p for name, p in PROJECTORS.items() if p.initial_state == "fixed"}
 # What learning (A, B) or the set from a recording magnifies the rounding of its entries by.
 CONDITIONING = 1e3
