@@ -26,8 +26,6 @@ ENFORCEMENTS = {
     "convex": "convex",
     "clean_estimate": "on the clean estimate",
     "conditional": "conditional",
-    "conditional_standardised": "every step, standardised metric",
-    "conditional_physical": "every step, physical metric",
     "literal": "as printed",
 }
 WORDS: dict[str, dict[str, str]] = {
