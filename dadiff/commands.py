@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
 import tempfile
 from collections.abc import Callable
@@ -28,6 +29,7 @@ def reported(program: str, work: Callable[[], int | None]) -> int:
         sys.stderr.write(f"{program}: error: {in_one_line(error)}\n")
         return FAILED
     except KeyboardInterrupt as error:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # it ends already
         said = f" ({error})" if str(error) else ""
         sys.stderr.write(f"{program}: interrupted{said}; the same command goes on from what is stored\n")
         return INTERRUPTED

@@ -45,7 +45,8 @@ def raising(error: BaseException) -> Callable[[], None]:
         ),
     ],
 )
-def test_an_end_that_a_person_can_mend_is_one_line(error, code, told, capsys):
+def test_an_end_that_a_person_can_mend_is_one_line(error, code, told, capsys, monkeypatch):
+    monkeypatch.setattr("signal.signal", lambda number, handler: None)
     assert reported("dadiff", raising(error)) == code
     assert capsys.readouterr().err == f"{told}\n"
 

@@ -246,24 +246,26 @@ def test_own_recordings_teach_the_dynamics(tmp_path, system):
     assert compared(learned, known)["principal_angle"] < 1e-10
 
 
-def test_recordings_of_other_lengths_are_named(tmp_path):
-    record(tmp_path, "a.npz", length=60)
-    file = record(tmp_path, "b.npz", length=50)
-    with pytest.raises(DataError, match=re.escape(f"{file}: has S = 50 inputs, a.npz has 60; cut to equal S")):
-        NpzRecordings(str(tmp_path)).record(SYSTEM)
+def test_all_samples_of_recordings_of_different_lengths_are_used(tmp_path):
+    record(tmp_path, "a.npz", length=130)
+    record(tmp_path, "b.npz", length=50)
+    recording = NpzRecordings(str(tmp_path)).record(SYSTEM)
+    assert (recording.count, recording.length) == (4, 50)
+    with np.load(tmp_path / "a.npz") as written:
+        assert {row.tobytes() for row in written["controls"]} <= {
+            row.tobytes() for row in recording.inputs.reshape(-1, 2)
+        }
 
 
 def test_recordings_of_another_system_are_named(tmp_path):
     file = record(tmp_path, "a.npz", double_integrator(axes=1))
-    with pytest.raises(
-        DataError, match=re.escape(f"{file}: array inputs or controls has shape (60, 1); expected (any, 2)")
-    ):
+    with pytest.raises(DataError, match=re.escape(f"{file}: array states has shape (61, 2); expected (any, 4)")):
         NpzRecordings(str(tmp_path)).record(SYSTEM)
 
 
 def test_a_recording_needs_one_state_more_than_inputs(tmp_path):
-    file = record(tmp_path, "a.npz", states=np.zeros((60, 4)))
-    with pytest.raises(DataError, match=re.escape(f"{file}: array states has shape (60, 4); expected (61, 4)")):
+    file = record(tmp_path, "a.npz", states=np.zeros((59, 4)))
+    with pytest.raises(DataError, match=re.escape(f"{file}: has 59 states and 60 inputs; expected one state more")):
         NpzRecordings(str(tmp_path)).record(SYSTEM)
 
 

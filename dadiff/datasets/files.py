@@ -5,7 +5,8 @@ Files are read without pickle, so nothing in them is executed. Every complaint n
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import logging
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -13,12 +14,16 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from dadiff.datasets.generated import Part
+from dadiff.datasets.logs import ENDINGS, list_logs, of_one_length, read_runs
+from dadiff.datasets.physics import check_excited, judge
 from dadiff.errors import ConfigError, DataError
 from dadiff.outside import digest_of, npz
 from dadiff.systems import Recording, System
 from dadiff.tasks import Cases, Demonstrations, Task
 
 INPUT_NAMES = ("inputs", "controls")
+
+log = logging.getLogger(__name__)
 
 
 @runtime_checkable
@@ -49,33 +54,34 @@ def fingerprint(folder: Path) -> str:
     return digest_of(sorted(folder.rglob("*.npz")), folder)
 
 
-def read_array(file: Path, names: Sequence[str], shape: tuple[int | None, ...]) -> np.ndarray:
+def read_array(file: Path, names: Sequence[str], shape: tuple[int | None, ...], remedy: str = "") -> np.ndarray:
     """One float64 array from an .npz file.
 
     Args:
         names: accepted names, the first that is there is read.
         shape: expected shape; None accepts any length.
+        remedy: what to do if it is missing or has another shape.
 
     Raises:
         DataError: if it is missing, holds objects, has another shape, or values that are not finite.
     """
     label = " or ".join(names)
-    array = _first_of(file, names, label)
+    array = _first_of(file, names, label, remedy)
     if array.dtype.kind not in "fiu":
         raise DataError(f"{file}: array {label} holds {array.dtype}; expected real numbers")
     expected = "(" + ", ".join("any" if k is None else str(k) for k in shape) + ")"
     if array.ndim != len(shape) or any(k not in (None, size) for k, size in zip(shape, array.shape, strict=True)):
-        raise DataError(f"{file}: array {label} has shape {array.shape}; expected {expected}")
+        raise DataError(f"{file}: array {label} has shape {array.shape}; expected {expected}{remedy}")
     if not np.isfinite(array).all():
         raise DataError(f"{file}: array {label} holds a value that is not finite")
     return array.astype(np.float64)
 
 
-def _first_of(file: Path, names: Sequence[str], label: str) -> np.ndarray:
+def _first_of(file: Path, names: Sequence[str], label: str, remedy: str) -> np.ndarray:
     with npz(file, f"array {label}") as archive:
         present = [name for name in names if name in archive.files]
         if not present:
-            raise DataError(f"{file}: has no array {label}; found {', '.join(archive.files) or 'none'}")
+            raise DataError(f"{file}: has no array {label}; found {', '.join(archive.files) or 'none'}{remedy}")
         return np.asarray(archive[present[0]])
 
 
@@ -89,11 +95,13 @@ class NpzTrajectories:
     Args:
         path: the folder.
         train_size, test_size: how many files to take, in the order of their names; None takes all.
+        allow_mismatch: take data that do not obey the configured system, with a warning.
     """
 
     path: str
     train_size: int | None = None
     test_size: int | None = None
+    allow_mismatch: bool = False
 
     def determined_by(self, part: Part) -> dict[str, Any]:
         """What the folder holds, in place of where it lies."""
@@ -103,12 +111,18 @@ class NpzTrajectories:
     def train(self, task: Task, system: System) -> Demonstrations:
         """The trajectories of `path`/train."""
         tau, environment = self._read("train", task, system, self.train_size)
-        return Demonstrations(tau, environment)
+        states, inputs = system.layout(task.horizon).split(tau)
+        ratio = judge(system, states, inputs, str(Path(self.path) / "train"), self.allow_mismatch)
+        return Demonstrations(tau, environment, {"residual": ratio})
 
     def test(self, task: Task, system: System) -> Cases:
         """The cases of `path`/test."""
         tau, environment = self._read("test", task, system, self.test_size)
-        return Cases(task.condition(system), environment, tau)
+        learned, _ = self._read("train", task, system, self.train_size)
+        shared = len({row.tobytes() for row in learned} & {row.tobytes() for row in tau})
+        if shared:
+            log.warning("%s: %d of %d test trajectories are also in train", self.path, shared, len(tau))
+        return Cases(task.condition(system), environment, tau, {"also_in_train": shared})
 
     def _read(self, part: str, task: Task, system: System, count: int | None) -> tuple[np.ndarray, np.ndarray]:
         if not isinstance(system, System) or system.robots:
@@ -122,10 +136,12 @@ class NpzTrajectories:
                 "dataset=environments for own environments of the obstacle task"
             )
         files = list_files(Path(self.path) / part)[:count]
-        states = np.stack([read_array(f, ["states"], (T + 1, n)) for f in files])
-        inputs = np.stack([read_array(f, INPUT_NAMES, (T, m)) for f in files])
+        fit = f"; the task has {T} inputs and one state more: set task.horizon, cut, or add the state that is missing"
+        states = np.stack([read_array(f, ["states"], (T + 1, n), fit) for f in files])
+        inputs = np.stack([read_array(f, INPUT_NAMES, (T, m), fit) for f in files])
+        add = "; add it: a trajectory's E is where it starts and where it should go"
         x_init, target = (
-            np.stack([read_array(f, [name], (n,)) for f in files]) for name in ("initial_state", "target_state")
+            np.stack([read_array(f, [name], (n,), add) for f in files]) for name in ("initial_state", "target_state")
         )
         for file, start, first in zip(files, x_init, states[:, 0], strict=True):
             if not np.allclose(start, first, rtol=1e-4, atol=1e-6):
@@ -135,28 +151,34 @@ class NpzTrajectories:
 
 @dataclass(frozen=True)
 class NpzRecordings:
-    """Own recordings Γ: a folder of .npz files with `states (S+1, n)` and `inputs` or `controls (S, m)`, equal in S.
+    """Own recordings Γ: a folder of .npz, .csv or .parquet files with `states` and `inputs` or `controls`.
 
-    Of a fleet, one such folder a robot: `path`/robot_0, robot_1, ...
+    Of a fleet, one such folder a robot: `path`/robot_0, robot_1, ... See `dadiff.datasets.logs` for what is taken.
+    They are held against the configured system, see `dadiff.datasets.physics`.
 
     Args:
         path: the folder.
+        columns: of tables, `states` and `inputs` as lists of column names.
+        allow_mismatch: take data that do not obey the configured system, with a warning.
     """
 
     path: str
+    columns: Mapping[str, Sequence[str]] | None = None
+    allow_mismatch: bool = False
 
     def fingerprint(self) -> str:
         """What the folder holds, in place of where it lies."""
-        if not any(Path(self.path).glob("robot_*/*.npz")):
-            list_files(Path(self.path))
-        return fingerprint(Path(self.path))
+        folder = Path(self.path)
+        if not any(folder.glob("robot_*/*")):
+            list_logs(folder)
+        return digest_of(sorted(file for file in folder.rglob("*") if file.suffix in ENDINGS), folder)
 
     def record(self, system: System) -> Recording:
-        """All files side by side.
+        """All runs side by side.
 
         Raises:
-            DataError: if a file's sizes disagree with the system or with the first file; if a robot has no folder,
-                or another number or length of recordings than the first one.
+            DataError: if a file's sizes disagree with the system, or its steps; if a robot has no folder, or another
+                number or length of recordings than the first one.
         """
         if not system.robots:
             return self._read(Path(self.path), system)
@@ -166,22 +188,32 @@ class NpzRecordings:
                 f"{self.path}: no recordings for {', '.join(missing)}; expected one folder for each of "
                 f"{len(folders)} robots"
             )
-        recordings = [self._read(folder, system) for folder in folders]
+        recordings = [self._read(folder, system, judged=False) for folder in folders]
         for folder, recording in zip(folders, recordings, strict=True):
             if recording.inputs.shape != recordings[0].inputs.shape:
                 raise DataError(
                     f"{folder}: holds {recording.count} recordings with S = {recording.length}, {folders[0].name} "
                     f"{recordings[0].count} with {recordings[0].length}; cut to equal number and S"
                 )
-        return Recording(*(np.stack([getattr(r, part) for r in recordings]) for part in ("states", "inputs")))
+        return Recording(np.stack([r.states for r in recordings]), np.stack([r.inputs for r in recordings]))
 
-    def _read(self, folder: Path, system: System) -> Recording:
-        files = list_files(folder)
-        inputs = [read_array(f, INPUT_NAMES, (None, system.input_dim)) for f in files]
-        for file, u in zip(files, inputs, strict=True):
-            if len(u) != len(inputs[0]):
-                raise DataError(
-                    f"{file}: has S = {len(u)} inputs, {files[0].name} has {len(inputs[0])}; cut to equal S"
-                )
-        states = [read_array(f, ["states"], (len(inputs[0]) + 1, system.state_dim)) for f in files]
-        return Recording(np.stack(states), np.stack(inputs))
+    def _read(self, folder: Path, system: System, *, judged: bool = True) -> Recording:
+        runs = {file: read_runs(file, system, self.columns) for file in list_logs(folder)}
+        _tell_duplicates([(file, x) for file, its in runs.items() for x, _ in its])
+        notes: dict[str, float] = {}
+        if judged:
+            ratios = [judge(system, *of_one_length(its), str(file), self.allow_mismatch) for file, its in runs.items()]
+            notes = {"recording_residual": max(ratios)}
+        states, inputs = of_one_length([run for its in runs.values() for run in its])
+        if not self.allow_mismatch:
+            notes["excitation_condition"] = check_excited(inputs, system.state_dim + 1, str(folder))
+        return Recording(states, inputs, notes)
+
+
+def _tell_duplicates(runs: Sequence[tuple[Path, np.ndarray]]) -> None:
+    """Say which runs are copies of others: they add nothing to what is learned from them."""
+    seen: dict[bytes, Path] = {}
+    for file, states in runs:
+        first = seen.setdefault(states.tobytes(), file)
+        if first != file:
+            log.warning("%s: is a copy of %s, and adds nothing", file, first.name)

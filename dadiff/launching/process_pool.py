@@ -11,7 +11,8 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerProcess
@@ -101,8 +102,21 @@ def _start_server(threads: int) -> None:
     """Start the server that jobs are forked from; it inherits the limits on threads of its environment."""
     from multiprocessing import forkserver
 
-    with environment({**limits(threads), **SERVER}):
+    with environment({**limits(threads), **SERVER}), _deaf():
         forkserver.ensure_running()
+
+
+@contextmanager
+def _deaf() -> Iterator[None]:
+    """What is started meanwhile ignores Ctrl-C, which is the launcher's to handle."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _answer(entry: Process) -> tuple[Status, str | None]:

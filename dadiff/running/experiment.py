@@ -118,6 +118,8 @@ def measured_projection(experiment: Experiment, environment: np.ndarray) -> tupl
     if behaviour is None or projection is None:
         return None, {}
     measures = {"projector_setup_seconds": fitted + bind.seconds, **behaviour.notes}
+    if "recording" in experiment.sources:
+        measures |= experiment.sources["recording"].notes
     if experiment.sources:
         held = pins(experiment.parts.projector, experiment.layout, experiment.condition.get(environment, "x_init"))
         measures |= compared(behaviour, Known().fit(experiment.layout, experiment.target), held)

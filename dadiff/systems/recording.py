@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -22,10 +22,12 @@ class Recording:
     Args:
         states: (*robots, count, S+1, n).
         inputs: (*robots, count, S, m).
+        notes: what a reader should know of it, by name, measured with the run.
     """
 
     states: np.ndarray = field(repr=False)
     inputs: np.ndarray = field(repr=False)
+    notes: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         x, u = self.states.shape, self.inputs.shape

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import os
+import sqlite3
 import tempfile
 import urllib.error
 import urllib.request
@@ -13,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dadiff.errors import StoreError
+from dadiff.errors import MissingExtraError, StoreError
 from dadiff.outside import without_passwords
 from dadiff.store.files import locked
 from dadiff.tracking.database import SQLITE, prepare_database
@@ -57,12 +58,11 @@ def prepare_store(uri: str, experiment: str, artifacts: str | None) -> str:
     """
     if uri.startswith(("http://", "https://")):
         _probe(uri)
-    with locked(_lock_file(uri), f"the MLflow store {without_passwords(uri)}"):
+    with locked(_lock_file(uri), f"the MLflow store {without_passwords(uri)}"), refused(uri):
         if uri.startswith(SQLITE):
             _set_up()
             prepare_database(Path(uri.removeprefix(SQLITE)), experiment, artifacts)
-        with refused(uri):
-            return _experiment_id(open_client(uri), experiment, None if uri.startswith("http") else artifacts)
+        return _experiment_id(open_client(uri), experiment, None if uri.startswith("http") else artifacts)
 
 
 def _experiment_id(client: MlflowClient, name: str, artifacts: str | None) -> str:
@@ -105,7 +105,7 @@ def failures() -> tuple[type[Exception], ...]:
     from mlflow.exceptions import MlflowException
     from sqlalchemy.exc import SQLAlchemyError
 
-    return (MlflowException, SQLAlchemyError, OSError, StoreError)
+    return (MlflowException, SQLAlchemyError, sqlite3.Error, OSError, ImportError, StoreError)
 
 
 @contextmanager
@@ -117,6 +117,12 @@ def refused(uri: str) -> Iterator[None]:
     """
     try:
         yield
+    except ModuleNotFoundError as error:
+        extra = "postgresql" if uri.startswith("postgresql") else "mysql"
+        raise MissingExtraError(
+            f"tracking: {error.name} is not installed, which {without_passwords(uri)} needs; install it with: "
+            f"pip install 'dadiff[{extra}]'"
+        ) from error
     except failures() as error:
         raise StoreError(
             f"tracking: the MLflow store {without_passwords(uri)} refuses ({first_line(error)}); mend tracking.uri"
