@@ -47,7 +47,7 @@ def folder(tmp_path) -> Path:
 
 
 def test_sizes_are_as_asked_and_the_same_seed_gives_the_same_data():
-    one, two, other = (Generated(50, 7, seed) for seed in (1, 1, 2))
+    one, two, other = (Generated(50, 7, seed=seed) for seed in (1, 1, 2))
     train, test = one.train(TASK, SYSTEM), one.test(TASK, SYSTEM)
     assert train.trajectories.shape == (50, SYSTEM.layout(6).size)
     assert test.reference.shape == (7, SYSTEM.layout(6).size)

@@ -290,7 +290,7 @@ def every_set() -> dict[str, TrajectorySet]:
     limited = replace(SYSTEM, bounds=Bounds(-2.0, 2.0))
     learned = {kind.__name__: kind().fit(LAYOUT, SYSTEM, recording, shown) for kind in (HankelLowRank, IdentifiedSoft)}
     plain = {kind.__name__: kind().fit(LAYOUT, SYSTEM) for kind in (Inpainting, Known)}
-    return {**learned, **plain, "Bounded": Known(bounded=True).fit(LAYOUT, limited)}
+    return {**learned, **plain, "Bounded": Known(bounds="enforced").fit(LAYOUT, limited)}
 
 
 @pytest.mark.parametrize("name", ["HankelLowRank", "IdentifiedSoft", "Inpainting", "Known", "Bounded"])
