@@ -44,10 +44,11 @@ def test_commands_run(arguments, tmp_path):
     assert "normalised" in done.stdout + done.stderr
 
 
-@pytest.mark.parametrize("example", EXAMPLES, ids=lambda text: text.splitlines()[0])
+@pytest.mark.parametrize("example", EXAMPLES, ids=lambda text: text.splitlines()[2])
 def test_examples_run(example, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    exec(compile(example, "README.md", "exec"), {})
+    small = ", ".join(f'"{override}"' for override in [*SMALL, "tracking.enabled=false"])
+    exec(compile(example.replace('"training=quick"]', f'"training=quick", {small}]'), "README.md", "exec"), {})
 
 
 OWN = [shlex.split(line)[1:] for line in re.findall(r"`(dadiff [^`]*components=\[mylab\][^`]*)`", README)]
