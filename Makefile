@@ -39,7 +39,7 @@ report: install
 	@echo "runs:    $(RUN)/mlflow ui --backend-store-uri sqlite:///$(abspath $(OUTPUTS))/mlflow.db"
 
 test: .venv/checks
-	OMP_NUM_THREADS=1 $(RUN)/pytest
+	OMP_NUM_THREADS=1 $(RUN)/pytest -n 2 --dist loadfile
 
 slow: .venv/servers
 	OMP_NUM_THREADS=1 $(RUN)/pytest -m slow
