@@ -143,3 +143,9 @@ def test_a_configuration_is_checked_before_it_is_printed(dadiff):
     mistaken = dadiff("--cfg", "job", "evaluation.samples=2.5")
     assert "evaluation (evaluation/default.yaml): samples is 2.5" in refused(mistaken)
     assert not mistaken.stdout
+
+
+def test_a_parameter_of_the_command_takes_the_place_of_the_sweep_files(dadiff):
+    """3 projectors x 2 seeds x 2 lengths x 4 noises, and 2 that read no recording, for each of 2 trainings."""
+    done = dadiff("+sweeps=recordings", "recording.seed=0,1", "recording.length=100,150", "dry_run=true")
+    assert "100 runs, 0 done, 100 to run" in done.stdout

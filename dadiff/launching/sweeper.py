@@ -21,8 +21,10 @@ class CellSweeper(BasicSweeper):
         if self.hydra_context is None or self.launcher is None:
             raise ConfigError("hydra.sweeper: is not set up")
         parser = OverridesParser.create(config_loader=self.hydra_context.config_loader)
-        overrides = parser.parse_overrides([*self._parse_config(), *arguments])
-        batches = self.split_arguments(overrides, self.max_batch_size)
+        given = parser.parse_overrides(arguments)
+        named = {override.key_or_group for override in given}  # whatever stands before the name, such as `++`
+        filed = [o for o in parser.parse_overrides(self._parse_config()) if o.key_or_group not in named]
+        batches = self.split_arguments([*filed, *given], self.max_batch_size)
         if not batches[0]:
             raise ConfigError("the sweep has no runs: one of its parameters ranges over nothing")
         return [self.launcher.launch(batch, initial_job_idx=0) for batch in batches]
