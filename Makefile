@@ -22,7 +22,7 @@ install: .venv/installed
 	@touch $@
 
 .venv/checks: .venv/installed
-	$(RUN)/python tools/install.py '.[test,lint,ipopt]'
+	$(RUN)/python tools/install.py '.[test,lint,ipopt,mujoco]'
 	@touch $@
 
 .venv/servers: .venv/checks

@@ -30,6 +30,12 @@ def limits(threads: int) -> dict[str, str]:
     return {**dict.fromkeys(LIMITS, str(threads)), "GOMP_SPINCOUNT": waiting}
 
 
+def own() -> int:
+    """How many threads this process may take: what its environment says, else all its cores."""
+    stated = os.environ.get("OMP_NUM_THREADS", "")
+    return max(1, int(stated)) if stated.isdigit() else cores()
+
+
 def cores() -> int:
     """The cores that this process may use, which a container's share of processor time may reduce."""
     return max(1, math.ceil(min(affine_cores(), share(CONTROL_GROUP))))

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 import yaml
 from hydra import compose, initialize_config_dir
 
@@ -15,7 +16,16 @@ from dadiff.config import build
 from dadiff.config.build import resolve
 from dadiff.config.composed import plain
 from dadiff.launching import register
-from dadiff.systems import AffineSystem, Family, GaussianExcitation, Linear, System, TimeVarying, double_integrator
+from dadiff.systems import (
+    AffineSystem,
+    Family,
+    GaussianExcitation,
+    Linear,
+    MujocoFamily,
+    System,
+    TimeVarying,
+    double_integrator,
+)
 
 CONF = Path(__file__).parent.parent / "conf"
 
@@ -126,6 +136,8 @@ OWN = {"A": [[0.9, 0.1], [-0.2, 0.8]], "B": [[0.0], [0.5]], "c": [0.1, -0.2], "b
 def shipped_system(preset: str) -> System:
     """The system of a preset; of a family three robots."""
     made = component("system", preset, **(OWN if preset == "inline" else {}))
+    if isinstance(made, MujocoFamily):
+        pytest.importorskip("mujoco", reason="the extra mujoco is not installed")
     return made.inside(3, np.random.default_rng(0)) if isinstance(made, Family) else made
 
 

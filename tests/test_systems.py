@@ -130,8 +130,12 @@ class TestShippedSystems:
     """Whatever lies in conf/system/: linearised as it steps, simulated as it steps, robots in one go as alone."""
 
     def points(self, system: System, rng) -> tuple[np.ndarray, np.ndarray]:
-        lead = (*system.robots, 4)
-        return rng.standard_normal((*lead, system.state_dim)), rng.standard_normal((*lead, 5, system.input_dim))
+        """Within the system's bounds."""
+        n, m, lead = system.state_dim, system.input_dim, (*system.robots, 4)
+        x, u = rng.standard_normal((*lead, n)), rng.standard_normal((*lead, 5, m))
+        within = zip((x, u), (system.bounds.of_states(n), system.bounds.of_inputs(m)), strict=True)
+        x, u = (np.clip(part, 0.9 * low, 0.9 * high) for part, (low, high) in within)
+        return x, u
 
     def test_the_linearisation_is_the_derivative_of_the_step(self, preset, rng):
         system = shipped_system(preset)

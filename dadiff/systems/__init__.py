@@ -4,6 +4,7 @@ from dadiff.systems.families import DampedIntegrators, Family, LaggedIntegrators
 from dadiff.systems.given import from_control, inline
 from dadiff.systems.integrators import double_integrator
 from dadiff.systems.linear import AffineSystem, Linear, TimeVarying, require_affine
+from dadiff.systems.mujoco import MujocoFamily, MujocoRobot, mujoco_robot
 from dadiff.systems.nonlinear import Continuous, Nonlinear, Simulated
 from dadiff.systems.quadrotors import PlanarQuadrotor, PlanarQuadrotors
 from dadiff.systems.recording import GaussianExcitation, Recording
@@ -18,6 +19,8 @@ __all__ = [
     "GaussianExcitation",
     "LaggedIntegrators",
     "Linear",
+    "MujocoFamily",
+    "MujocoRobot",
     "Nonlinear",
     "PlanarQuadrotor",
     "PlanarQuadrotors",
@@ -30,5 +33,6 @@ __all__ = [
     "double_integrator",
     "from_control",
     "inline",
+    "mujoco_robot",
     "require_affine",
 ]

@@ -1,0 +1,206 @@
+"""Robots in MuJoCo: the simulator's own steps, what a model may be, and what is refused."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dadiff.errors import ConfigError, DataError, MissingExtraError
+from dadiff.planning.codec import Decoder, Encoder
+from dadiff.systems import MujocoFamily, MujocoRobot, Simulated, mujoco_robot
+from dadiff.systems.mjcf import Mjcf, located, mujoco
+
+pytest.importorskip("mujoco", reason="the extra mujoco is not installed")
+
+ARM = ("joint0", "joint1")
+WITHIN_60_PERCENT = dict.fromkeys(("mass", "damping", "gear"), (0.4, 1.6))
+MODEL = """
+<mujoco><compiler meshdir="shapes"/><option timestep="0.01"/>
+  <asset><mesh name="body" file="body.obj"/></asset>
+  <worldbody><include file="body.xml"/></worldbody>
+  <actuator><motor name="push" joint="swing" ctrlrange="-1 1"/><position joint="slide" kp="3"/></actuator>
+</mujoco>"""
+BODY = """
+<mujocoinclude><body><joint name="slide" type="slide" axis="1 0 0"/><geom size="0.1"/>
+  <body><joint name="swing" axis="0 1 0" range="-30 30"/><geom type="mesh" mesh="body" pos="0 0 -0.2"/></body>
+</body></mujocoinclude>"""
+SHAPE = "v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nv 0 0 0.1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+
+
+@pytest.fixture(scope="module")
+def pendulum() -> MujocoRobot:
+    return mujoco_robot("inverted_pendulum")
+
+
+@pytest.fixture(scope="module")
+def reacher() -> MujocoRobot:
+    return mujoco_robot("reacher", ARM)
+
+
+@pytest.fixture
+def own(tmp_path):
+    """A model of one's own, in three files."""
+    (tmp_path / "shapes").mkdir()
+    (tmp_path / "robot.xml").write_text(MODEL)
+    (tmp_path / "body.xml").write_text(BODY)
+    (tmp_path / "shapes" / "body.obj").write_text(SHAPE)
+    return tmp_path / "robot.xml"
+
+
+def points(robot: MujocoRobot, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    lead = (*robot.robots, count)
+    return 0.3 * rng.standard_normal((*lead, robot.state_dim)), 0.3 * rng.standard_normal((*lead, robot.input_dim))
+
+
+@pytest.mark.parametrize(("name", "path"), [("pendulum", "inverted_pendulum"), ("reacher", "reacher")])
+def test_it_steps_as_the_simulator_does(name, path, request):
+    """One point at a time; the reacher of the wheel carries its target along, which does not move."""
+    import mujoco as package
+
+    robot, model = request.getfixturevalue(name), package.MjModel.from_xml_path(str(located(path)))
+    k, data = robot.state_dim // 2, package.MjData(model)
+    for x, u in zip(*points(robot, 5), strict=True):
+        package.mj_resetData(model, data)
+        data.qpos[:k], data.qvel[:k], data.ctrl[:] = x[:k], x[k:], u
+        package.mj_step(model, data, nstep=2)
+        reached = np.concatenate([data.qpos[:k], data.qvel[:k]])
+        np.testing.assert_allclose(robot.step(x, u), reached, atol=1e-12)
+
+
+def test_names_units_and_ranges_are_the_models(pendulum, reacher):
+    assert pendulum.state_names == ("slider", "hinge", "slider velocity", "hinge velocity")
+    assert pendulum.state_units == ("m", "rad", "m/s", "rad/s")
+    assert pendulum.input_names == ("slide",)
+    assert pendulum.bounds.of_inputs(1)[1] == [3]
+    np.testing.assert_allclose(pendulum.bounds.of_states(4)[1], [1, np.pi / 2, np.inf, np.inf])
+    assert reacher.input_names == ("motor of joint0", "motor of joint1")
+    np.testing.assert_array_equal(reacher.bounds.of_states(4)[0], [-np.inf, -3, -np.inf, -np.inf])
+    assert (reacher.time_step, pendulum.time_step) == (0.02, 0.04)
+    narrow = mujoco_robot("inverted_pendulum", bounds={"input_high": 1.0})
+    assert narrow.bounds.of_inputs(1) == ([-3], [1])
+
+
+def test_threads_and_batches_change_nothing(monkeypatch):
+    robots = MujocoFamily("inverted_pendulum", **WITHIN_60_PERCENT).inside(3, np.random.default_rng(0))
+    x, u = points(robots, 200)
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    alone = robots.step(x, u)
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")
+    np.testing.assert_array_equal(robots.step(x, u), alone)
+    for k in (0, 2):
+        np.testing.assert_array_equal(robots.take([k]).step(x[[k], :2], u[[k], :2]), alone[[k], :2])
+
+
+def test_derivatives_are_those_of_central_differences(reacher):
+    x, u = points(reacher, 20)
+    central = Simulated(reacher.step, 4, 2, difference=1e-5).linearise(x, u)
+    for found, expected in zip(reacher.linearise(x, u), central, strict=True):
+        np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
+def test_factors_act_on_mass_damping_and_gear(pendulum):
+    """All forces and all masses times k leave a motion as it is; the gear alone scales what an input does."""
+    x, u = points(pendulum, 20)
+    twice = replace(pendulum, mass=2.0, damping=2.0)  # of gravity the masses take care
+    np.testing.assert_allclose(twice.step(x, 2 * u), pendulum.step(x, u), atol=1e-9)
+    np.testing.assert_allclose(replace(twice, gear=2.0).step(x, u), pendulum.step(x, u), atol=1e-9)
+    assert np.abs(replace(pendulum, damping=2.0).step(x, u) - pendulum.step(x, u)).max() > 1e-3
+
+
+def test_what_diverges_is_nan_and_nothing_is_written(pendulum, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    x = np.array([[0.0, 0.1, 0.0, 1e7], [np.nan, 0, 0, 0], [0.0, 0.1, 0.0, 0.0]])
+    states = pendulum.simulate(x, np.full((3, 9, 1), 0.1))
+    assert not np.isfinite(states[0, -1]).all()
+    assert np.isnan(states[1, 1:]).all()
+    assert np.isfinite(states[2]).all()
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_robot_can_be_sent_and_stored(reacher):
+    x, u = points(reacher, 3)
+    expected = reacher.step(x, u)
+    encode = Encoder()
+    plain = encode(reacher, "system")
+    for copy in (pickle.loads(pickle.dumps(reacher)), Decoder(encode.arrays, "file")(plain)):
+        np.testing.assert_array_equal(copy.step(x, u), expected)
+
+
+def test_a_model_of_ones_own_in_several_files(own):
+    robot = mujoco_robot(str(own))
+    assert robot.state_names[:2] == ("slide", "swing")
+    assert robot.input_names == ("push", "motor of slide")
+    np.testing.assert_allclose(robot.bounds.of_states(4)[1][1], np.pi / 6)
+    before = MujocoFamily(str(own)).fingerprint()
+    step = robot.step(*points(robot, 3))
+    encode = Encoder()
+    plain = encode(robot, "system")
+    for file in (own, own.parent / "body.xml"):
+        file.write_text(file.read_text() + " ")
+    assert MujocoFamily(str(own)).fingerprint() != before
+    for file in own.parent.rglob("*.*"):
+        file.unlink()
+    again = Decoder(encode.arrays, "file")(plain)  # needs none of the files
+    np.testing.assert_array_equal(again.step(*points(robot, 3)), step)
+    with pytest.raises(DataError, match=r"MuJoCo cannot read the model .*swing"):  # which a motor moves
+        replace(robot, mjcf=replace(robot.mjcf, joints=("slide",)))
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "message"),
+    [
+        (lambda: mujoco_robot("reachr"), ConfigError, "no model 'reachr'; expected a path ending in .xml, or one of"),
+        (
+            lambda: mujoco_robot("reacher", ["elbow"]),
+            ConfigError,
+            "no joint elbow; the model has joint0, joint1, target_x",
+        ),
+        (lambda: mujoco_robot("ant"), ConfigError, "joint root of the model is free or a ball"),
+        (lambda: mujoco_robot("nowhere/robot.xml"), DataError, "nowhere/robot.xml: cannot be read"),
+        (lambda: mujoco_robot("reacher", frame_skip=0), ConfigError, "frame_skip is 0"),
+        (lambda: MujocoFamily("reacher", mass=(0.0, 1.0)), ConfigError, "factors are positive"),
+    ],
+)
+def test_what_is_no_robot_is_refused(make, error, message):
+    with pytest.raises(error, match=message):
+        make()
+
+
+@pytest.mark.parametrize(
+    ("model", "message"),
+    [
+        ("<mujoco", "is no MJCF"),
+        ('<!DOCTYPE m [<!ENTITY a "b">]><mujoco/>', "declares entities"),
+        ('<mujoco><include file="/etc/passwd"/></mujoco>', "lies outside of the model's folder"),
+        ('<mujoco><include file="../robot.xml"/></mujoco>', "lies outside of the model's folder"),
+        ('<mujoco><include file="pipe"/></mujoco>', "is no plain file"),
+        ('<mujoco><asset><mesh name="m" file="no.stl"/></asset></mujoco>', "no.stl: cannot be read"),
+        ("<mujoco><worldbody><geom/></worldbody></mujoco>", "MuJoCo cannot read the model"),
+        ("<mujoco><worldbody/></mujoco>", "a model needs joints and actuators"),
+    ],
+)
+def test_files_are_judged_before_they_are_read(model, message, tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "robot.xml").write_text(model)
+    with pytest.raises((DataError, ConfigError), match=message):
+        mujoco_robot(str(tmp_path / "robot.xml"))
+
+
+def test_a_stored_text_looks_for_nothing_on_the_disk(own):
+    for text in (MODEL, f'<mujoco><include file="{own}"/></mujoco>'):
+        with pytest.raises(DataError, match="which is not stored with it"):
+            Mjcf(text).compiled()
+
+
+def test_without_the_extra_the_message_names_it(monkeypatch):
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    with pytest.raises(MissingExtraError, match=r"mujoco is not installed; .*pip install 'dadiff\[mujoco\]'"):
+        mujoco()
+    with pytest.raises(MissingExtraError, match=r"dadiff\[mujoco\]"):
+        MujocoFamily("reacher").inside(1, np.random.default_rng(0))
