@@ -20,6 +20,7 @@ from dadiff.behaviours import (
     Known,
     KnownClear,
     Koopman,
+    Nominal,
     NoProjector,
     Pin,
     Projection,
@@ -41,10 +42,10 @@ from dadiff.trajectory.covariance import Covariance
 from dadiff.trajectory.hankel import identity_length, minimum_length, windows
 
 HORIZON, PLANS = 6, 5
-PROJECTORS = {  # what is believed of a family is no projection; see test_family.py
+PROJECTORS = {  # what is believed of a family is no projection of one robot's; see test_family.py
     name: projector
     for name, projector in variants("projector", {"initial_state": ("free", "fixed")}).items()
-    if not isinstance(projector, NoProjector | Inpainting | IdentifiedFamily)
+    if not isinstance(projector, NoProjector | Inpainting | IdentifiedFamily | Nominal)
 }
 ORTHOGONAL = {name: p for name, p in PROJECTORS.items() if not isinstance(p, RolloutProjector | KnownClear)}
 HOLDING = {name: p for name, p in PROJECTORS.items() if p.initial_state == "fixed"}

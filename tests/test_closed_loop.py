@@ -44,7 +44,13 @@ def test_a_row_for_each_controller_interval_and_case():
     best = table[(table["controller"] == "optimal") & (table["every"] == 1)]
     np.testing.assert_array_equal(best["cost_ratio"], 1)
     np.testing.assert_array_equal(table[table["controller"] == "optimal"]["cost_ratio_same"], 1)
-    assert means(table)["closed_loop_optimal_1"] == 1
+    found = means(table)
+    for one in ("closed_loop_optimal_1", "closed_loop_same_optimal_10", "closed_loop_time_optimal_1"):
+        assert found[one] == 1
+    assert found["closed_loop_same_receding_10"] == pytest.approx(
+        table[(table["controller"] == "receding") & (table["every"] == 10)]["cost_ratio_same"].mean()
+    )
+    assert found["closed_loop_time_receding_1"] > 0
 
 
 def test_exact_plans_replanned_at_each_step_cost_what_the_optimum_costs():
@@ -57,6 +63,22 @@ def test_gains_help_where_plans_are_seldom():
     table = bench(disturbance=0.1, replan_every=(30,), controllers=("receding", "tracking")).table()
     mean = table.groupby("controller")["cost_ratio"].mean()
     assert mean["tracking"] < mean["receding"]
+
+
+def test_costs_are_over_those_of_the_expert_at_the_shortest_interval():
+    table = bench(replan_every=(10, 5), controllers=("optimal",)).table()
+    mean = table.groupby("every")["cost_ratio"].mean()
+    assert mean[5] == 1
+    assert mean[10] > 1
+
+
+def test_with_the_right_model_the_expert_is_the_expert_and_with_a_wrong_one_it_pays():
+    table = bench(disturbance=0.05, controllers=("modelled",)).table()
+    np.testing.assert_allclose(table["cost_ratio_same"], 1)
+    wrong = double_integrator(time_step=0.3)
+    planner = replace(PLANNER, behaviour=Known("fixed").fit(LAYOUT, system=wrong))
+    wronged = Bench(planner, CASES, ClosedLoop(replan_every=(10,), controllers=("modelled",))).table()
+    assert (wronged["cost_ratio_same"] > 1.01).all()
 
 
 def test_every_controller_meets_the_same_disturbances():

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from laws import composed
 
+from dadiff.behaviours import Nominal, model_of
 from dadiff.errors import ConfigError
+from dadiff.evaluation import replay
 from dadiff.running.assembly import Experiment
 from dadiff.running.experiment import execute
 from dadiff.systems import DampedIntegrators, PlanarQuadrotor, PlanarQuadrotors
@@ -124,8 +126,36 @@ def test_in_closed_loop_the_expert_plans_anew(task, rng):
     np.testing.assert_array_equal(R, 0.05 * np.eye(2))
 
 
-def test_a_run_closes_the_loop(tmp_path):
-    overrides = ["evaluation=closed_loop", "evaluation.replan_every=[5]", "evaluation.steps=10"]
-    run = execute(Experiment.of(composed(*TINY, *overrides, f"output_dir={tmp_path}")))
-    assert run.record.metrics["closed_loop_optimal_5"] >= 0.9
-    assert np.isfinite(run.record.metrics["closed_loop_receding_5"])
+def test_the_expert_begins_where_it_is_told_and_may_be_wrong_about_the_robot(task, rng):
+    robots = task.target(PlanarQuadrotors())
+    cases = task.cases(robots, 3, rng)
+    near = cases.reference + 1e-3 * rng.standard_normal(cases.reference.shape)
+    found = task.solve(robots, cases.environment, start=near)
+    np.testing.assert_allclose(found, cases.reference, atol=1e-4)
+    nominal = Nominal("fixed").fit(robots.layout(task.horizon), robots)
+    model = model_of(nominal)
+    np.testing.assert_array_equal(model.parameter_table, np.broadcast_to([1.0, 1.2, 0.5], (5, 3)))
+    planned = task.solve(robots, cases.environment, model)[..., None, :]
+    rollout = replay(robots, robots.layout(task.horizon), planned, cases.x_init)
+    assert (task.score(robots, cases, planned, rollout).per_plan["cost_ratio"] > 1).all()
+
+
+LOOP = ["evaluation=closed_loop", "evaluation.replan_every=[5]", "evaluation.steps=10"]
+ROUGH = ["recording=quadrotor", "projector.features=[constant,identity,trigonometric,control_affine]"]
+ROUGH += ["projector.angles=[2]", "projector.ridge=0.01", "projector.initial_state=fixed"]
+
+
+@pytest.mark.parametrize("overrides", [[], ["projector=nominal"], ["projector=identified", *ROUGH]])
+def test_a_run_closes_the_loop_with_whatever_robot_the_planner_believes_in(overrides, tmp_path):
+    controllers = "evaluation.controllers=[receding,tracking,modelled,optimal]"
+    delayed = ["evaluation.delay=1"] if not overrides else []
+    configuration = composed(*TINY, *LOOP, controllers, *delayed, *overrides, f"output_dir={tmp_path}")
+    metrics = execute(Experiment.of(configuration)).record.metrics
+    assert metrics["closed_loop_optimal_5"] == 1
+    for controller in ("receding", "tracking", "modelled"):
+        assert np.isfinite(metrics[f"closed_loop_same_{controller}_5"])
+    assert ("model_cost_ratio" in metrics) == bool(overrides)
+    if overrides:
+        assert metrics["closed_loop_same_modelled_5"] != 1
+        assert metrics["model_cost_ratio"] > 1
+        assert metrics["prediction_error"] > 0

@@ -11,6 +11,7 @@ from dadiff.behaviours.components import (
     Known,
     KnownClear,
     Koopman,
+    Nominal,
     NoProjector,
     Projector,
     RolloutProjector,
@@ -21,7 +22,7 @@ from dadiff.behaviours.least_squares import Estimate, Transitions, least_squares
 from dadiff.behaviours.lifted import Lifted
 from dadiff.behaviours.manifold import Manifold
 from dadiff.behaviours.pins import Pin
-from dadiff.behaviours.prediction import prediction_error
+from dadiff.behaviours.prediction import model_of, prediction_error
 from dadiff.behaviours.projection import Projection, ProjectionInfo
 from dadiff.behaviours.sets import Dynamics, Everything, Rollout, Span, TrajectorySet, Uncertain, compared
 from dadiff.behaviours.stages import Stages
@@ -44,6 +45,7 @@ __all__ = [
     "Lifted",
     "Manifold",
     "NoProjector",
+    "Nominal",
     "Pin",
     "Projection",
     "ProjectionInfo",
@@ -57,6 +59,7 @@ __all__ = [
     "Uncertain",
     "compared",
     "least_squares",
+    "model_of",
     "pins",
     "prediction_error",
 ]

@@ -21,7 +21,7 @@ from dadiff.behaviours.pins import Pin
 from dadiff.behaviours.sets import Dynamics, Everything, InitialState, Rollout, Span, TrajectorySet, Uncertain
 from dadiff.behaviours.stages import stages_of
 from dadiff.errors import ConfigError, ExcitationError, NotApplicableError
-from dadiff.systems import AffineSystem, Recording, System
+from dadiff.systems import AffineSystem, Recording, Robots, System
 from dadiff.systems.features import Features, Term
 from dadiff.trajectory.hankel import identity_length, trajectory_matrix
 from dadiff.trajectory.layout import TrajectoryLayout
@@ -136,6 +136,30 @@ class Known:
         if not isinstance(system, AffineSystem):
             return within(Manifold(layout, system, self.sweeps, notes=notes), self.bounds, system)
         return within(Dynamics(layout, stages_of(system, layout.horizon), notes=notes), self.bounds, system)
+
+
+@dataclass(frozen=True)
+class Nominal(Known):
+    """`Known` dynamics, but of the middle of the robot's family, whatever the robot: a mismatch of the plant."""
+
+    def fit(
+        self,
+        layout: TrajectoryLayout,
+        system: System | None = None,
+        recording: Recording | None = None,
+        demonstrations: np.ndarray | None = None,
+    ) -> Dynamics | Manifold | Bounded:
+        """The trajectories of the nominal robot.
+
+        Raises:
+            NotApplicableError: if the system is of no family.
+        """
+        system = _required(system, "nominal", "system")
+        if not isinstance(system, Robots) or system.family is None:
+            raise NotApplicableError(
+                "projector nominal: the system is of no family whose middle could be taken for it; use projector=known"
+            )
+        return super().fit(layout, system.nominal)
 
 
 @dataclass(frozen=True)

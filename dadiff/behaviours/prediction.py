@@ -1,26 +1,17 @@
-"""How well estimated dynamics predict: the error of states from x(0) and inputs alone, over the whole horizon."""
+"""What a set takes the robot's dynamics for, and how well that predicts states from x(0) and inputs alone."""
 
 from __future__ import annotations
-
-from typing import Protocol
 
 import numpy as np
 
 from dadiff.behaviours.bounded import Bounded
+from dadiff.behaviours.clear import Clear
 from dadiff.behaviours.lifted import Lifted
 from dadiff.behaviours.manifold import Manifold
 from dadiff.behaviours.sets import Dynamics, TrajectorySet
-from dadiff.systems import System
+from dadiff.systems import Linear, System, TimeVarying
 
 TINY = float(np.finfo(np.float64).tiny)
-
-
-class Simulable(Protocol):
-    """A system, or the stages of one."""
-
-    def simulate(self, x_init: np.ndarray, inputs: np.ndarray) -> np.ndarray:
-        """States (*robots, plans, T+1, n) from x(0) (*robots, plans, n) and inputs (*robots, plans, T, m)."""
-        ...
 
 
 def prediction_error(learned: TrajectorySet, truth: System, tau: np.ndarray) -> dict[str, float]:
@@ -31,7 +22,7 @@ def prediction_error(learned: TrajectorySet, truth: System, tau: np.ndarray) -> 
     Args:
         tau: trajectories (*robots, plans, d) whose starts and inputs are taken.
     """
-    dynamics = _dynamics(learned)
+    dynamics = learned if isinstance(learned, Lifted) else model_of(learned)
     if dynamics is None:
         return {}
     states, inputs = learned.layout.split(tau)
@@ -42,10 +33,15 @@ def prediction_error(learned: TrajectorySet, truth: System, tau: np.ndarray) -> 
     return {"prediction_error": float(error.mean())}
 
 
-def _dynamics(learned: TrajectorySet) -> Simulable | None:
-    if isinstance(learned, Manifold):
-        return learned.system
-    if isinstance(learned, Lifted):
-        return learned
-    dynamics = learned.dynamics if isinstance(learned, Bounded) else learned
-    return dynamics.stages if isinstance(dynamics, Dynamics) else None
+def model_of(behaviour: TrajectorySet | None) -> System | None:
+    """The system that a set takes the robot for; None where it says nothing of a step: subspaces, lifted dynamics."""
+    if isinstance(behaviour, Manifold):
+        return behaviour.system
+    if isinstance(behaviour, Bounded | Clear):
+        behaviour = behaviour.dynamics
+    if not isinstance(behaviour, Dynamics):
+        return None
+    stages = behaviour.stages
+    if all((M[..., :1, :, :] == M).all() for M in (stages.A, stages.B, stages.c[..., None])):
+        return Linear(stages.A[..., 0, :, :], stages.B[..., 0, :, :], stages.c[..., 0, :], robots=behaviour.robots)
+    return TimeVarying(stages.A, stages.B, stages.c, robots=behaviour.robots)

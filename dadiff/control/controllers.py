@@ -94,7 +94,7 @@ class RecedingHorizon:
         follow: makes the controller that follows a plan; open loop, or with gains.
 
     Attributes:
-        seconds: what each planning took, for the whole batch.
+        seconds: processor time of each planning, for the whole batch; others may use the machine.
     """
 
     plan: Callable[[np.ndarray, Trajectories | None], Trajectories]
@@ -112,10 +112,10 @@ class RecedingHorizon:
     def act(self, t: int, x: np.ndarray) -> np.ndarray:
         """See the class."""
         if t % self.every == 0:
-            begun = time.perf_counter()
+            begun = time.process_time()
             start = None if self._last is None else shifted(*self._last, self.every)
             self._last = self.plan(x, start)
-            self.seconds.append(time.perf_counter() - begun)
+            self.seconds.append(time.process_time() - begun)
             self._following, self._since = self.follow(*self._last), t
         if self._following is None:
             raise ConfigError(f"controller: is first asked at t = {t}; an episode begins at t = 0")

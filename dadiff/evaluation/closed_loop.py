@@ -1,7 +1,8 @@
 """Closed loop: episodes in which plans are made anew from where the robot is, under disturbances.
 
-Every controller meets the same disturbances and is held against the expert that plans anew at each step (`optimal`, 1).
-What separates methods is how seldom they may plan: the interval between plans is the axis.
+Every controller meets the same disturbances and is held against the expert that knows the robot and plans at the
+shortest interval, and against it at the same interval. What separates methods is how seldom they may plan: the interval
+between plans is the axis.
 """
 
 from __future__ import annotations
@@ -9,17 +10,19 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property, partial
 
 import numpy as np
 import pandas as pd
 
+from dadiff.behaviours import model_of
 from dadiff.control import Controller, Episode, OpenLoop, RecedingHorizon, Tracking, run
 from dadiff.control.controllers import Trajectories, tracking_gains
 from dadiff.errors import ConfigError, NotApplicableError
 from dadiff.evaluation.settings import ClosedLoop, ControllerChoice
 from dadiff.planning import Planner, Plans
 from dadiff.randomness import numpy_generator
-from dadiff.systems import TimeVarying
+from dadiff.systems import System, TimeVarying
 from dadiff.tasks.task import Cases, Steering
 
 TIMED_PLANS, TIMED_SECONDS = 100, 5.0  # plans of one case, one at a time, for the latency
@@ -58,23 +61,30 @@ class Bench:
         """K."""
         return self.evaluation.steps or self.planner.layout.horizon
 
+    @cached_property
+    def model(self) -> System:
+        """What the planner takes for the robot's dynamics: the robot itself where its set says nothing of them."""
+        return model_of(self.planner.behaviour) or self.planner.system
+
     def table(self) -> pd.DataFrame:
         """A row for each controller, interval, robot and case.
 
-        cost_ratio is against the expert that plans at each step, cost_ratio_same against it at the same interval;
-        distance is |x(K) - goal|, largest_input max |u|. An episode that left float range has cost_ratio inf.
+        cost_ratio is against the expert at the shortest interval, cost_ratio_same against it at the same one; distance
+        is |x(K) - goal|, largest_input max |u|, seconds the processor time that a plan took in the batch, time_share it
+        over the expert's. An episode that left float range has cost_ratio inf.
         """
-        best = self._cost(self.episode("optimal", 1))
-        rows = []
-        for every in self.evaluation.replan_every:
-            same = self._cost(self.episode("optimal", every))
+        intervals, rows = sorted(self.evaluation.replan_every), []
+        yardsticks = {every: self._driven("optimal", every) for every in intervals}
+        best = self._cost(yardsticks[intervals[0]][0])
+        for every, (same, seconds) in yardsticks.items():
             for kind in self.evaluation.controllers:
-                rows.append(self._rows(kind, every, self.episode(kind, every), best, same))
+                episode, spent = (same, seconds) if kind == "optimal" else self._driven(kind, every)
+                rows.append(self._rows(episode, best, self._cost(same)).assign(
+                    controller=kind, every=every, seconds=spent, time_share=spent / seconds
+                ))  # fmt: skip
         return pd.concat(rows, ignore_index=True)
 
-    def _rows(
-        self, kind: ControllerChoice, every: int, episode: Episode, best: np.ndarray, same: np.ndarray
-    ) -> pd.DataFrame:
+    def _rows(self, episode: Episode, best: np.ndarray, same: np.ndarray) -> pd.DataFrame:
         cost = self._cost(episode)
         away = episode.states[..., -1, :] - self.task.goal(self.planner.system, self.cases.environment)
         values = {
@@ -86,32 +96,39 @@ class Bench:
         index = np.indices(cost.shape, dtype=np.int32).reshape(cost.ndim, -1)
         names = ("robot", "case")[-cost.ndim :]
         return pd.DataFrame(
-            {"controller": kind, "every": every, **dict(zip(names, index, strict=True))}
+            dict(zip(names, index, strict=True))
             | {name: np.where(np.isfinite(v), v, np.inf).ravel() for name, v in values.items()}
         )
 
     def episode(self, kind: ControllerChoice, every: int) -> Episode:
         """One controller on all cases."""
-        x_init, planner = self.cases.x_init, self.planner
-        return run(planner.system, self.controller(kind, every), x_init, self.steps, self._disturbance(),
-                   delay=self.evaluation.delay)  # fmt: skip
+        return self._driven(kind, every)[0]
 
-    def controller(self, kind: ControllerChoice, every: int) -> Controller:
+    def _driven(self, kind: ControllerChoice, every: int) -> tuple[Episode, float]:
+        """The episode, and the processor seconds that each of its plans took."""
+        x_init, controller = self.cases.x_init, self.controller(kind, every)
+        episode = run(self.planner.system, controller, x_init, self.steps, self._disturbance(),
+                      delay=self.evaluation.delay)  # fmt: skip
+        return episode, float(np.mean(controller.seconds)) / (x_init.size // x_init.shape[-1])
+
+    def controller(self, kind: ControllerChoice, every: int) -> RecedingHorizon:
         """See `ClosedLoop.controllers`."""
-        if kind == "optimal":
-            return RecedingHorizon(self._optimal_plan, every)
+        if kind in ("optimal", "modelled"):
+            model = self.planner.system if kind == "optimal" else self.model
+            return RecedingHorizon(partial(self._optimal_plan, model), every)
         follow = self._tracked if kind == "tracking" else (lambda states, inputs: OpenLoop(inputs))
         return RecedingHorizon(self._planned(), every, follow)
 
-    def _optimal_plan(self, x: np.ndarray, start: Trajectories | None) -> Trajectories:
+    def _optimal_plan(self, model: System, x: np.ndarray, start: Trajectories | None) -> Trajectories:
         layout, system = self.planner.layout, self.planner.system
-        return layout.split(self.task.solve(system, self._from(x)))
+        begin = layout.flatten(*start) if start is not None and self.evaluation.warm_start else None
+        return layout.split(self.task.solve(system, self._from(x), model, begin))
 
     def _planned(self) -> PlanAnew:
         return PlanAnew(self.planner, self._from, self.evaluation.seed, warm=self.evaluation.warm_start)
 
     def _tracked(self, states: np.ndarray, inputs: np.ndarray) -> Controller:
-        gains = tracking_gains(self.planner.system, states, inputs, *self.task.weights(self.planner.system))
+        gains = tracking_gains(self.model, states, inputs, *self.task.weights(self.planner.system))
         return Tracking(states, inputs, gains)
 
     def _from(self, x: np.ndarray) -> np.ndarray:
@@ -175,8 +192,19 @@ def latencies(planner: Planner, environment: np.ndarray, count: int = TIMED_PLAN
     return np.array(seconds)
 
 
+MEANS = {"": "cost_ratio", "same_": "cost_ratio_same", "time_": "time_share"}
+"""What of the table of episodes becomes a metric of the run."""
+
+
 def means(table: pd.DataFrame) -> dict[str, float]:
-    """`closed_loop_<controller>_<every>`: the mean cost ratio over robots and cases."""
-    groups = table.groupby(["controller", "every"], as_index=False)["cost_ratio"].mean()
-    rows = zip(groups["controller"], groups["every"], groups["cost_ratio"], strict=True)
-    return {f"closed_loop_{controller}_{every}": float(mean) for controller, every, mean in rows}
+    """Means over robots and cases for each controller and interval.
+
+    `closed_loop_<controller>_<every>` of the cost ratio, `closed_loop_same_...` of that at the same interval,
+    `closed_loop_time_...` of the processor time that a plan took over the expert's.
+    """
+    found = table.groupby(["controller", "every"], as_index=False)[list(MEANS.values())].mean()
+    return {
+        f"closed_loop_{what}{controller}_{every}": float(value)
+        for what, column in MEANS.items()
+        for controller, every, value in zip(found["controller"], found["every"], found[column], strict=True)
+    }

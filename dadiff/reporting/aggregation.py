@@ -9,6 +9,7 @@ method and never enter a mean.
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -281,6 +282,17 @@ def _table_with(cell: Cell, metric: str) -> str | None:
     return None
 
 
+EPISODES = re.compile(r"closed_loop_(?P<same>same_)?(?P<controller>[a-z]+)_(?P<every>\d+)")
+"""Metrics of episodes in closed loop: the cost over that of the expert, at the shortest or the same interval."""
+
+
+def _episodes(cell: Cell, wanted: re.Match[str]) -> np.ndarray:
+    """([robots,] cases)."""
+    table = cell.table("closed_loop")
+    rows = table[(table["controller"] == wanted["controller"]) & (table["every"] == int(wanted["every"]))]
+    return dense(rows, "cost_ratio_same" if wanted["same"] else "cost_ratio", where=f"run {cell.key}, closed_loop")
+
+
 def _of_cell(cell: Cell, metric: str, group: str | None) -> np.ndarray:
     if name := _table_with(cell, metric):
         if (name, metric) not in cell.means:
@@ -290,6 +302,9 @@ def _of_cell(cell: Cell, metric: str, group: str | None) -> np.ndarray:
         return means if group is None else means[_robots_in(cell, group)]
     if metric not in cell.metrics:
         raise StoreError(f"run {cell.key} ({cell.name}): has no metric {metric!r}; found {', '.join(cell.metrics)}")
+    if (wanted := EPISODES.fullmatch(metric)) and cell.has("closed_loop"):
+        values = _episodes(cell, wanted)
+        return values if group is None else values[_robots_in(cell, group)]
     return np.asarray(cell.metrics[metric], dtype=np.float64)
 
 

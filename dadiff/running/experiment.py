@@ -15,7 +15,7 @@ import pandas as pd
 import torch
 import yaml
 
-from dadiff.behaviours import Known, compared, pins, prediction_error
+from dadiff.behaviours import Known, Nominal, compared, model_of, pins, prediction_error
 from dadiff.diffusion.chain import Samples
 from dadiff.diffusion.enforcement import PostHoc
 from dadiff.errors import NotApplicableError
@@ -31,8 +31,9 @@ from dadiff.randomness import numpy_generator, torch_generator
 from dadiff.running.assembly import Experiment
 from dadiff.running.provenance import record_of
 from dadiff.store import StoredRun
-from dadiff.systems import Robots, System
+from dadiff.systems import Robots, System, TimeVarying
 from dadiff.tasks import Scores
+from dadiff.tasks.task import Steering
 from dadiff.trajectory import TrajectoryLayout
 
 EXAMPLE_ROBOTS = 3
@@ -120,11 +121,26 @@ def measured_projection(experiment: Experiment, environment: np.ndarray) -> tupl
     measures = {"projector_setup_seconds": fitted + bind.seconds, **behaviour.notes}
     if "recording" in experiment.sources:
         measures |= experiment.sources["recording"].notes
-    if experiment.sources:
+    if experiment.sources or isinstance(experiment.parts.projector, Nominal):
         held = pins(experiment.parts.projector, experiment.layout, experiment.condition.get(environment, "x_init"))
         measures |= compared(behaviour, Known().fit(experiment.layout, experiment.target), held)
         measures |= prediction_error(behaviour, experiment.target, experiment.cases.reference)
+        measures |= cost_of_model(experiment, model_of(behaviour))
     return Timed(projection, experiment.device), measures
+
+
+def cost_of_model(experiment: Experiment, model: System | None) -> dict[str, float]:
+    """`model_cost_ratio`: what the expert's plans for a model cost on the robot: what its errors cost, whoever plans.
+
+    Nothing where there is no model, or no expert that takes one.
+    """
+    task, target, cases = experiment.parts.task, experiment.target, experiment.cases
+    if model is None or isinstance(model, TimeVarying) or not isinstance(task, Steering):
+        return {}
+    planned = task.solve(target, cases.environment, model)[..., None, :]
+    rollout = replay(target, experiment.layout, planned, cases.x_init)
+    ratio = task.score(target, cases, planned, rollout).per_plan["cost_ratio"].mean(axis=(-2, -1))
+    return {"model_cost_ratio": float(ratio.mean()), "model_cost_ratio_median": float(np.median(ratio))}
 
 
 def unconverged(projection: Any) -> dict[str, float]:

@@ -25,10 +25,23 @@ class Robots(System):
     Args:
         parameters: name -> (robots,).
         distance: how far each lies outside of its family's ranges, in their widths, (robots,); see `Ranges.distance`.
+        family: of which they were drawn.
     """
 
     parameters: Mapping[str, np.ndarray] = field(default_factory=dict, repr=False)
     distance: np.ndarray = field(default_factory=lambda: np.zeros(0), repr=False)
+    family: Family[Any] | None = field(default=None, repr=False)
+
+    @property
+    def nominal(self) -> Robots:
+        """As many robots of the middle of the family's ranges.
+
+        Raises:
+            ConfigError: if they are of no family.
+        """
+        if self.family is None:
+            raise ConfigError("system: these robots are of no family, so that none of them is nominal")
+        return self.family.robots(np.tile(self.family.ranges.middle, (*self.robots, 1)))
 
     @property
     def parameter_table(self) -> np.ndarray:
@@ -90,6 +103,11 @@ class Ranges:
     def high(self) -> np.ndarray:
         """(p,)."""
         return np.array([high for _, high in self.bounds.values()], dtype=np.float64)
+
+    @property
+    def middle(self) -> np.ndarray:
+        """(p,)."""
+        return (self.low + self.high) / 2
 
     def inside(self, count: int, rng: np.random.Generator) -> np.ndarray:
         """Uniform draws, (count, p)."""
@@ -192,6 +210,7 @@ class LinearFamily(Family[LinearRobots]):
             input_names=self.input_names,
             parameters=parameters,
             distance=self.ranges.distance(values),
+            family=self,
         )
 
 

@@ -12,7 +12,7 @@ phi is put together from terms, in this order; s(x) stands for the state feature
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -169,6 +169,10 @@ class Regressed(System):
         by_x, by_u = self.features.jacobian(x, u)
         theta = self._theta(x.ndim)
         return affine(np.eye(self.state_dim) + theta @ by_x, theta @ by_u, self.step(x, u), x, u)
+
+    def take(self, index: Sequence[int] | np.ndarray) -> Regressed:
+        """The robots at `index`."""
+        return replace(self, theta=self.theta[index])
 
     def _theta(self, dimensions: int) -> np.ndarray:
         """theta beside points of so many dimensions: robots first."""

@@ -136,4 +136,5 @@ class PlanarQuadrotors(Family[Quadrotors]):
             bounds=Bounds.of(self.bounds),
             parameters=self.named(values),
             distance=self.ranges.distance(values),
+            family=self,
         )

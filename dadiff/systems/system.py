@@ -11,10 +11,11 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
+from typing import Self
 
 import numpy as np
 
-from dadiff.errors import ConfigError, ShapeError
+from dadiff.errors import ConfigError, NotApplicableError, ShapeError
 from dadiff.trajectory.layout import TrajectoryLayout
 
 Times = int | np.ndarray
@@ -172,6 +173,17 @@ class System(ABC):
     def singular(self, states: np.ndarray) -> np.ndarray | None:
         """At how many steps of states (..., T+1, n) a change of coordinates breaks down, (...); None without one."""
         return None
+
+    def take(self, index: Sequence[int] | np.ndarray) -> Self:
+        """The robots at `index`, as a system of so many.
+
+        Raises:
+            NotApplicableError: if its robots are not told apart, or it is a single one.
+        """
+        raise NotApplicableError(
+            f"system: {type(self).__name__} does not give some of its robots; use one of a family, such as "
+            "system=planar_quadrotors"
+        )
 
     def layout(self, horizon: int) -> TrajectoryLayout:
         """The layout of this system's trajectories over T inputs, with its names and units."""

@@ -15,6 +15,7 @@ from typing import ClassVar
 import numpy as np
 
 from dadiff.errors import ConfigError
+from dadiff.systems import AffineSystem
 from dadiff.systems.families import LinearFamily, LinearRobots
 from dadiff.tasks.lqr import LQR, ends_layout
 from dadiff.tasks.quadratic import Range, Weight
@@ -106,10 +107,16 @@ class Fleet(ManyRobots):
         bounded = {name: ratios[name] for name in ("bounded_cost_ratio",) if name in ratios}
         return replace(scores, per_plan=scores.per_plan | bounded)
 
-    def solve(self, system: LinearRobots, environment: np.ndarray) -> np.ndarray:
-        """Each robot's optimum tau (robots, ..., d) without process noise for E (robots, ..., c)."""
+    def solve(
+        self,
+        system: LinearRobots,
+        environment: np.ndarray,
+        model: AffineSystem | None = None,
+        start: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """Each robot's optimum tau (robots, ..., d) without process noise for E (robots, ..., c); see `LQR.solve`."""
         ends = {name: self.condition(system).get(environment, name) for name in ("x_init", "target")}
-        return self.lqr.solve(system, ends_layout(system).pack(**ends))
+        return self.lqr.solve(system, ends_layout(system).pack(**ends), model)
 
     def goal(self, system: LinearRobots, environment: np.ndarray) -> np.ndarray:
         """The target (robots, ..., n)."""

@@ -180,11 +180,22 @@ class LQR:
         noise = rng.standard_normal((*environment.shape[:-1], law.noise_map.shape[-1]))
         return law.mean(environment) + along(law.noise_map, noise)
 
-    def solve(self, system: AffineSystem, environment: np.ndarray) -> np.ndarray:
-        """The optimum tau (*robots, ..., d) without process noise for [x_init; target] (*robots, ..., 2n)."""
-        cost, ends = self.cost(system), self.condition(system).unpack(environment)
-        feedback = optimal_feedback(system, cost.Q, cost.R, self.horizon, cost.terminal)
-        return follow(system, feedback, ends["x_init"], ends["target"])
+    def solve(
+        self,
+        system: AffineSystem,
+        environment: np.ndarray,
+        model: AffineSystem | None = None,
+        start: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """The optimum tau (*robots, ..., d) without process noise for [x_init; target] (*robots, ..., 2n).
+
+        Args:
+            model: what is taken for the system.
+            start: of no use to a closed form.
+        """
+        cost, ends, model = self.cost(system), self.condition(system).unpack(environment), model or system
+        feedback = optimal_feedback(model, cost.Q, cost.R, self.horizon, cost.terminal)
+        return follow(model, feedback, ends["x_init"], ends["target"])
 
     def goal(self, system: AffineSystem, environment: np.ndarray) -> np.ndarray:
         """The target (*robots, ..., n)."""

@@ -16,7 +16,7 @@ import numpy as np
 
 from dadiff.errors import ConfigError
 from dadiff.experts.ilqr import Metric, Solution, Tracking, solve
-from dadiff.systems import Family, Robots
+from dadiff.systems import Family, Robots, System
 from dadiff.tasks.robots import ManyRobots, joined, scores_of
 from dadiff.tasks.task import Cases, Demonstrations, Scores, encoded
 from dadiff.trajectory import Channel, Layout
@@ -112,10 +112,17 @@ class Manoeuvre(ManyRobots):
         optimal = self.cost(system, cases.reference, target)
         return scores_of(system, self.cost(system, rollout, target[..., None, :]) / optimal[..., None])
 
-    def solve(self, system: Robots, environment: np.ndarray) -> np.ndarray:
-        """Each robot's optimum tau (robots, ..., d) for E (robots, ..., c)."""
+    def solve(
+        self, system: Robots, environment: np.ndarray, model: System | None = None, start: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Each robot's optimum tau (robots, ..., d) for E (robots, ..., c).
+
+        Args:
+            model: what is taken for the robots, of as many; None is what they are.
+            start: tau to begin from; None begins at rest at the target.
+        """
         ends = {name: self.condition(system).get(environment, name) for name in ("x_init", "target")}
-        return self.optimum(system, self._ends(system).pack(**ends)).tau
+        return self.optimum(model or system, self._ends(system).pack(**ends), start).tau
 
     def goal(self, system: Robots, environment: np.ndarray) -> np.ndarray:
         """At rest at the target, (robots, ..., n)."""
@@ -130,7 +137,7 @@ class Manoeuvre(ManyRobots):
         """The cost (...) of trajectories (..., d) towards targets (..., p), see the module."""
         return self.metric(system).squared(tau - self._at_rest(system, target))
 
-    def metric(self, system: Robots) -> Metric:
+    def metric(self, system: System) -> Metric:
         """Q, R and w along the horizon."""
         Q = np.repeat(np.diag(np.asarray(self.state_cost, dtype=np.float64))[None], self.horizon + 1, axis=0)
         Q[-1] *= self.terminal_weight
@@ -138,7 +145,7 @@ class Manoeuvre(ManyRobots):
         layout = system.layout(self.horizon)
         return Metric(layout, Q, R, np.zeros((layout.size, 0)))
 
-    def optimum(self, system: Robots, environment: np.ndarray) -> Solution:
+    def optimum(self, system: System, environment: np.ndarray, start: np.ndarray | None = None) -> Solution:
         """Each robot's optimum in environments [x_init; target] (robots, plans, c)."""
         ends = self._ends(system).unpack(environment)
         reference, metric = self._at_rest(system, ends["target"]), self.metric(system)
@@ -147,10 +154,10 @@ class Manoeuvre(ManyRobots):
         for first in range(0, len(environment), size):
             some = np.arange(first, min(first + size, len(environment)))
             problem = Tracking(system.take(some), metric, reference[some], ends["x_init"][some])
-            parts.append(solve(problem, sweeps=_SWEEPS))
+            parts.append(solve(problem, None if start is None else start[some], sweeps=_SWEEPS))
         return Solution(*(np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])))
 
-    def _ends(self, system: Robots) -> Layout:
+    def _ends(self, system: System) -> Layout:
         return Layout((Channel("x_init", system.state_dim), Channel("target", len(self.target_range))))
 
     def _draw(self, shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
@@ -158,7 +165,7 @@ class Manoeuvre(ManyRobots):
         ranges = np.array([*self.init_range, *self.target_range], dtype=np.float64)
         return rng.uniform(-ranges, ranges, size=(*shape, len(ranges)))
 
-    def _at_rest(self, system: Robots, target: np.ndarray) -> np.ndarray:
+    def _at_rest(self, system: System, target: np.ndarray) -> np.ndarray:
         """tau that stays at the target (..., p) without inputs, (..., d)."""
         n, m, T = system.state_dim, system.input_dim, self.horizon
         lead = target.shape[:-1]

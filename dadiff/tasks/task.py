@@ -168,8 +168,19 @@ class Continuing(Protocol):
 class Steering(Protocol):
     """A task that steers to a goal at quadratic cost, from whatever state: it can be planned for again and again."""
 
-    def solve(self, system: System, environment: np.ndarray) -> np.ndarray:
-        """The expert's tau (*robots, ..., d) without process noise for E (*robots, ..., c)."""
+    def solve(
+        self,
+        system: System,
+        environment: np.ndarray,
+        model: System | None = None,
+        start: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """The expert's tau (*robots, ..., d) without process noise for E (*robots, ..., c).
+
+        Args:
+            model: what the expert takes for the dynamics; None is the system.
+            start: tau to begin from, for experts that iterate.
+        """
         ...
 
     def goal(self, system: System, environment: np.ndarray) -> np.ndarray:
