@@ -1,4 +1,4 @@
-"""Every command and every example of the README runs."""
+"""Every command and every example of the README and of docs/ runs."""
 
 import os
 import re
@@ -9,23 +9,31 @@ from pathlib import Path
 
 import pytest
 
-from dadiff.reporting import published
+from dadiff.errors import ConfigError
+from dadiff.reporting import publishing
 from dadiff.reporting.claims import read_ledger
 from dadiff.reporting.definitions import FOLDER
 
 ROOT = Path(__file__).parent.parent
-README = (ROOT / "README.md").read_text()
+DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+TEXTS = {path.relative_to(ROOT).as_posix(): path.read_text() for path in DOCUMENTS}
 SMALL = ["dataset.train_size=40", "dataset.test_size=2", "evaluation.samples=1", "schedule.num_steps=30"]
 SMALL += ["training.steps=3", "training.warmup=0", "progress=false"]
 
 
-def blocks(language: str) -> list[str]:
-    found = re.findall(rf"^( *)```{language}\n(.*?)^ *```", README, flags=re.DOTALL | re.MULTILINE)
-    return [re.sub(rf"^{indent}", "", text, flags=re.MULTILINE) for indent, text in found]
+def blocks(language: str, text: str) -> list[str]:
+    found = re.findall(rf"^( *)```{language}\n(.*?)^ *```", text, flags=re.DOTALL | re.MULTILINE)
+    return [re.sub(rf"^{indent}", "", block, flags=re.MULTILINE) for indent, block in found]
 
 
-COMMANDS = [line.split("#")[0].split()[1:] for line in "".join(blocks("sh")).splitlines() if line.startswith("dadiff")]
-EXAMPLES = [block for block in blocks("python") if "class " not in block]
+LINES = [line.split("#")[0] for text in TEXTS.values() for block in blocks("sh", text) for line in block.splitlines()]
+COMMANDS = [shlex.split(line)[1:] for line in dict.fromkeys(LINES) if line.startswith("dadiff ")]
+EXAMPLES = [
+    pytest.param(block, id=f"{name}-{block.splitlines()[2]}")
+    for name, text in TEXTS.items()
+    for block in blocks("python", text)
+    if not block.startswith("# my")
+]
 
 
 def dadiff(arguments: list[str], folder: Path) -> subprocess.CompletedProcess:
@@ -44,19 +52,23 @@ def test_commands_run(arguments, tmp_path):
     assert "normalised" in done.stdout + done.stderr
 
 
-@pytest.mark.parametrize("example", EXAMPLES, ids=lambda text: text.splitlines()[2])
+@pytest.mark.parametrize("example", EXAMPLES)
 def test_examples_run(example, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     small = ", ".join(f'"{override}"' for override in [*SMALL, "tracking.enabled=false"])
-    exec(compile(example.replace('"training=quick"]', f'"training=quick", {small}]'), "README.md", "exec"), {})
+    exec(compile(example.replace('"training=quick"]', f'"training=quick", {small}]'), "example", "exec"), {})
 
 
-OWN = [shlex.split(line)[1:] for line in re.findall(r"`(dadiff [^`]*components=\[mylab\][^`]*)`", README)]
+OWN = [
+    shlex.split(line)[1:]
+    for text in TEXTS.values()
+    for line in re.findall(r"`(dadiff [^`]*components=\[mylab\][^`]*)`", text)
+]
 
 
 def write_own_files(folder: Path) -> None:
-    """The README's own components, verbatim, where their first lines say."""
-    for block in [*blocks("python"), *blocks("yaml")]:
+    """The own components of the documents, verbatim, where their first lines say."""
+    for block in [block for text in TEXTS.values() for kind in ("python", "yaml") for block in blocks(kind, text)]:
         if path := re.match(r"# (my[\w/.]+)\n", block):
             (folder / path[1]).parent.mkdir(parents=True, exist_ok=True)
             (folder / path[1]).write_text(block)
@@ -64,7 +76,7 @@ def write_own_files(folder: Path) -> None:
 
 def test_own_components_run_as_written_from_an_empty_folder(tmp_path):
     write_own_files(tmp_path)
-    assert len(OWN) == 2
+    assert len(OWN) >= 2
     for arguments in OWN:
         done = dadiff([*arguments, "denoiser=gaussian", "tracking.enabled=false", *SMALL], tmp_path)
         assert done.returncode == 0, done.stderr
@@ -74,11 +86,25 @@ def test_own_components_run_as_written_from_an_empty_folder(tmp_path):
     assert "components=[mylab]" in refused.stderr
 
 
-def test_the_table_of_verdicts_is_that_of_the_published_reports():
-    pattern = r"^\| (.*?) \| (.*?) \| (.*?) \| \[`?(\w+)`?\]\(reports/published/(\w+)\) \|$"
-    rows = re.findall(pattern, README, flags=re.MULTILINE)
-    said = published.verdicts(ROOT / "reports" / "published", read_ledger(FOLDER / "claims.yaml"))
-    assert rows == [(line.claim.claim, line.verdict, line.effect_words, name, name) for name, line in said]
+def test_what_documents_say_of_published_reports_is_what_these_say():
+    root, claims = ROOT / "reports" / "published", read_ledger(FOLDER / "claims.yaml")
+    assert publishing.documents(root) == DOCUMENTS
+    for path in DOCUMENTS:
+        assert path.read_text() == publishing.fill(path, root, claims)
+    assert all(
+        kind in "".join(TEXTS.values()) for kind in ("<!-- sentences: ", "<!-- ledger: short", "<!-- ledger: all")
+    )
+
+
+def test_a_block_of_unknown_kind_is_named(tmp_path):
+    document = tmp_path / "README.md"
+    document.write_text("<!-- table: all -->\n<!-- end -->\n")
+    with pytest.raises(ConfigError, match="unknown kind 'table'; expected sentences, ledger"):
+        publishing.fill(document, tmp_path / "reports" / "published", [])
+
+
+def test_the_readme_is_short():
+    assert len(TEXTS["README.md"].splitlines()) <= 150
 
 
 def test_what_is_published_is_whole_small_and_knows_no_place():
@@ -88,11 +114,12 @@ def test_what_is_published_is_whole_small_and_knows_no_place():
     for name in (path.name for path in folder.iterdir() if path.is_dir()):
         parts = {path.name for path in (folder / name).iterdir()}
         assert {"README.md", "report.json", "configurations.yaml", "figures", "tables"} <= parts
-        assert f"`{name}`" in README
+        assert f"`{name}`" in TEXTS["docs/results.md"]
     for path in files:
         assert not re.search(r"(?<![\w.])/(tmp|home|root|work)/", path.read_text())
 
 
-def test_pictures_of_the_readme_are_there():
-    for picture in re.findall(r"!\[.*?\]\((.*?)\)", README):
-        assert (ROOT / picture).is_file()
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+def test_links_and_pictures_are_there(document):
+    for target in re.findall(r"\]\(((?!https?:)[^)#]+)", document.read_text()):
+        assert (document.parent / target).exists()

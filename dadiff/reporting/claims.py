@@ -52,6 +52,7 @@ class Claim:
         paper: the paper's words or figure.
         note: how we read the claim.
         diverging: whether a method that diverged refutes the claim; else it is set aside.
+        short: the claim in a few words, of those that the README lists.
     """
 
     id: str
@@ -64,6 +65,7 @@ class Claim:
     paper: str = ""
     note: str = ""
     diverging: bool = False
+    short: str = ""
 
     def __post_init__(self) -> None:
         if self.statistic not in MEASURES:

@@ -1,23 +1,21 @@
 """Published reports as pages that a code host shows: `README.md` of each folder, and an index of all.
 
 A published folder holds `report.json`, of this format or the one before, and `configurations.yaml`, `figures/*.svg`,
-`tables/*.csv`. The pages are made from `report.json` alone, so that they can be written again at any time:
-
-    python -m dadiff.reporting.published reports/published
+`tables/*.csv`. The pages are made from `report.json` alone, so that they can be written again at any time, which
+`dadiff.reporting.publishing` does.
 """
 
 from __future__ import annotations
 
 import json
 import re
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from dadiff.errors import StoreError
-from dadiff.reporting.claims import Claim, read_ledger
-from dadiff.reporting.definitions import FOLDER, load, names
+from dadiff.reporting.claims import Claim
+from dadiff.reporting.definitions import load, names
 from dadiff.reporting.labels import column_name, column_value
 from dadiff.reporting.story import Line, ledger, main_columns, main_table, ratio_of, sentences
 
@@ -45,16 +43,6 @@ def read(folder: Path) -> dict[str, Any]:
 def folders(root: Path) -> list[Path]:
     """The published reports, by name."""
     return sorted(path.parent for path in root.glob("*/report.json"))
-
-
-def write_pages(root: Path) -> list[Path]:
-    """Write `README.md` of every published report, and of the folder that holds them; their paths."""
-    claims = read_ledger(FOLDER / "claims.yaml")
-    pages = {folder / "README.md": page(folder, claims) for folder in folders(root)}
-    pages[root / "README.md"] = index(root, claims)
-    for path, text in pages.items():
-        path.write_text(text, "utf-8")
-    return list(pages)
 
 
 def page(folder: Path, claims: list[Claim]) -> str:
@@ -190,8 +178,3 @@ def markdown(head: list[str], rows: list[list[str]]) -> str:
     return "\n".join(
         "| " + " | ".join(re.sub(r"\s+", " ", cell).replace("|", "\\|") for cell in line) + " |" for line in lines
     )
-
-
-if __name__ == "__main__":
-    for path in write_pages(Path(sys.argv[1])):
-        sys.stdout.write(f"{path}\n")

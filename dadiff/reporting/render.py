@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from dadiff.errors import StoreError
-from dadiff.reporting import configurations, published
+from dadiff.reporting import configurations, published, publishing
 from dadiff.reporting.claims import read_ledger
 from dadiff.reporting.definitions import FOLDER
 from dadiff.reporting.latex import to_latex
@@ -73,7 +73,7 @@ def publish(report: Path, folder: Path) -> None:
             shutil.copyfile(path, target)
     _remove(folder, older - _parts_in(folder))
     if folder.absolute().parent.name == "published":
-        published.write_pages(folder.absolute().parent)
+        publishing.write_pages(folder.absolute().parent)
     else:
         (folder / "README.md").write_text(published.page(folder, read_ledger(FOLDER / "claims.yaml")), "utf-8")
 
