@@ -217,9 +217,37 @@ def test_leading_directions_project_nearly_alike():
     assert errors[-1] < 1e-9 < errors[1] < errors[0] * 2
 
 
-def test_demonstrations_that_do_not_spread_are_refused():
+NO_SPREAD = Estimate(np.zeros((SIZE, SIZE)), np.linspace(0.5, 3, SIZE), np.ones(SIZE))
+
+
+def test_demonstrations_that_do_not_spread_leave_equal_variances_of_the_channels():
+    z = np.random.default_rng(0).standard_normal((5, SIZE))
+    P = Dynamics(LAYOUT, stages()).bind(WHERE)
+    np.testing.assert_allclose(P(z, NO_SPREAD.at(0.3, 0.01, 0.5)), P(z, NO_SPREAD.standardised), atol=1e-9)
+
+
+@pytest.mark.parametrize("ask", [lambda made: made.at(0.3), lambda made: made.diagonal(0.3)], ids=["full", "diagonal"])
+def test_without_shrinkage_they_say_nothing(ask):
     with pytest.raises(ConfigError, match="demonstrations do not spread at all given E"):
-        Estimate(np.zeros((SIZE, SIZE)), np.ones(SIZE), np.ones(SIZE))
+        ask(NO_SPREAD)
+
+
+def test_demonstrations_within_the_dynamics_are_not_moved_by_rounding():
+    """Sigma lies in the set, so that G C G' is 0 but for rounding, which must not become a gain."""
+    dynamics = Dynamics(LAYOUT, Stages(*(np.stack([part] * 3) for part in (np.eye(2), np.ones((2, 1)), np.zeros(2)))))
+    inside = dynamics.directions(np.arange(0)) @ np.random.default_rng(0).standard_normal((SIZE - 6, SIZE))
+    made = Estimate(inside @ inside.T, np.ones(SIZE), np.ones(SIZE))
+    z = np.random.default_rng(1).standard_normal((5, SIZE))
+    for alpha_bar in (0.0, 0.5):
+        np.testing.assert_allclose(dynamics.bind()(z, Covariance.dense(made.covariance)), z, atol=1e-9)
+        moved = dynamics.bind()(z, made.at(alpha_bar))
+        assert np.abs(moved - z).max() < 1e-6
+
+
+@pytest.mark.parametrize(("size", "kept"), [(600, 0), (601, 64)])
+def test_of_long_trajectories_leading_directions_are_kept(size, kept):
+    assert Conditional().kept(size) == kept
+    assert Conditional(directions=5).kept(size) == 5
 
 
 # --- the enforcement

@@ -52,7 +52,7 @@ EXACT = ("denoiser=gaussian",)
         "training.steps=10",
         "sampler.eta=1.0",
         "projector.initial_state=fixed",
-        "enforcement._target_=dadiff.diffusion.enforcement.PostHoc",
+        "enforcement.floor=0.1",
         "evaluation.samples=3",
         "coordinates=standardised",
     ],
@@ -72,7 +72,7 @@ def test_what_can_change_the_result_changes_the_key(override):
         ("tracking.experiment=other", ()),
         ("recording.length=500", ()),  # known reads no recording
         ("recording.length=500", VANILLA),
-        ("enforcement._target_=dadiff.diffusion.enforcement.PostHoc", VANILLA),
+        ("enforcement.floor=0.1", VANILLA),
         ("training.steps=10", EXACT),
     ],
 )
@@ -133,7 +133,7 @@ def test_data_from_files_count_by_content_and_not_by_place(tmp_path):
 
 
 def test_the_name_is_for_people():
-    assert identify(usual()).name == "lqr/known/normalised/mlp/dpm_solver/seed=0"
+    assert identify(usual()).name == "lqr/known/conditional/mlp/dpm_solver/seed=0"
     assert identify(changed(("recording.length=300",), HANKEL)).name.startswith("lqr/hankel_lowrank/S=300/w=0.01/")
     assert "known_fixed/" in identify(changed(("projector.initial_state=fixed",))).name
     assert "dpm_solver(eta=1.0)" in identify(changed(("sampler.eta=1.0",))).name

@@ -132,7 +132,7 @@ def in_metric(rows: Rows, metric: Covariance, places: np.ndarray, where: Coordin
     C, d = given.matrix, metric.size
     inner = rows.G @ C @ transposed(rows.G)
     inner = inner if rows.noise is None else inner + rows.noise @ transposed(rows.noise)
-    K = C @ transposed(rows.G) @ semidefinite_inverse(inner)
+    K = C @ transposed(rows.G) @ semidefinite_inverse(inner, _rounding(rows.G, C))
     correct = np.eye(d) - K @ rows.G
     moved = np.eye(d) - _columns(gain, places, d)
     lift = gain.copy()
@@ -140,6 +140,13 @@ def in_metric(rows: Rows, metric: Covariance, places: np.ndarray, where: Coordin
     centre = (K @ rows.g[..., None])[..., 0]
     made = _pinned_map(correct @ moved, centre, correct @ lift, places, where, orthogonal=False)
     return made if rows.noise is None else replace(made, spread=K @ rows.noise)
+
+
+def _rounding(G: np.ndarray, C: np.ndarray) -> np.ndarray:
+    """What the diagonal of G C G' may be where it is 0 but for rounding, (..., q)."""
+    deviation = np.sqrt(np.maximum(np.einsum("...ii->...i", C), 0))
+    largest = (np.abs(G) @ deviation[..., None])[..., 0]
+    return C.shape[-1] * np.finfo(np.float64).eps * np.square(largest)
 
 
 def _columns(gain: np.ndarray, places: np.ndarray, d: int) -> np.ndarray:

@@ -22,6 +22,9 @@ from dadiff.errors import ConfigError
 from dadiff.trajectory.arrays import Array, like
 from dadiff.trajectory.covariance import Covariance
 
+ALL_UP_TO = 600
+LEADING = 64
+
 Metric = Literal["estimate", "diagonal", "standardised", "physical"]
 
 
@@ -32,7 +35,9 @@ class Conditional(Never):
     Args:
         metric: C is the `estimate`'s covariance C_i + floor Sigma, its `diagonal`, or says nothing of the task: equal
             variances of `standardised` channels, or of `physical` units.
-        floor, shrinkage, directions: see `dadiff.diffusion.estimate.Estimate`.
+        floor, shrinkage: see `dadiff.diffusion.estimate.Estimate`.
+        directions: of C that are kept beside a diagonal; 0 keeps all, None does so up to d = ALL_UP_TO, and beyond it
+            LEADING, with which long horizons are projected onto in O(T).
         spread: draw tau_0 from N(tau0_hat, C), project the draw (Matheron's rule), and bridge from tau_i to it. The
             plans are then draws of the conditional law whatever the number of steps, exactly for a Gaussian prior
             without floor and shrinkage; the sampler only places the steps. Else the corrected estimate is what the
@@ -44,11 +49,11 @@ class Conditional(Never):
     metric: Metric = "estimate"
     floor: float = 0.01
     shrinkage: float = 0.5
-    directions: int = 0
+    directions: int | None = None
     spread: bool = False
 
     def __post_init__(self) -> None:
-        if not self.floor >= 0 or not 0 <= self.shrinkage <= 1 or self.directions < 0:
+        if not self.floor >= 0 or not 0 <= self.shrinkage <= 1 or (self.directions or 0) < 0:
             raise ConfigError(
                 f"enforcement: floor is {self.floor}, shrinkage {self.shrinkage}, directions {self.directions}; need "
                 "at least 0, in [0, 1] and at least 0"
@@ -70,10 +75,16 @@ class Conditional(Never):
         """C at step i."""
         estimate, alpha_bar = at.known_estimate(), float(at.schedule.alpha_bar[at.step.i])
         if self.metric == "estimate":
-            return estimate.at(alpha_bar, self.floor, self.shrinkage, self.directions)
+            return estimate.at(alpha_bar, self.floor, self.shrinkage, self.kept(estimate.size))
         if self.metric == "diagonal":
             return estimate.diagonal(alpha_bar, self.floor)
         return estimate.standardised if self.metric == "standardised" else estimate.physical
+
+    def kept(self, size: int) -> int:
+        """How many directions of C are kept of trajectories of size d; 0 for all."""
+        if self.directions is not None:
+            return self.directions
+        return 0 if size <= ALL_UP_TO else LEADING
 
 
 def bridge(step: Step, schedule: Schedule) -> Step:

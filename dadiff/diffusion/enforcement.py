@@ -78,7 +78,7 @@ class PostHoc(Never):
 
 @dataclass(frozen=True)
 class Normalised(Never):
-    """P + sqrt(beta_j) (I - P) on the sample: the paper's operator with gain 1 on im F. The default."""
+    """P + sqrt(beta_j) (I - P) on the sample: the paper's operator with gain 1 on im F."""
 
     def sample(self, tau: Array, at: Context) -> Array:
         """P(tau) + sqrt(beta_j) (tau - P(tau))."""

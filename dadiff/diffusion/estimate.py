@@ -24,6 +24,8 @@ from dadiff.trajectory.layout import TrajectoryLayout
 from dadiff.trajectory.subspace import regression
 
 KEPT = 64  # covariances that are held, the oldest given up first
+LEAST_SPREAD = 1e-10
+"""Of the channels' variances: what Sigma is shrunk towards at least, where demonstrations do not spread given E."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,11 +51,11 @@ class Estimate:
                 f"estimate: Sigma has shape {self.covariance.shape}, deviations {self.deviation.shape}, units "
                 f"{self.unit.shape}; expected (..., d, d), (d,), (d,)"
             )
-        if not np.einsum("...ii->...i", self.covariance).any(axis=-1).all():
-            raise ConfigError(
-                "estimate: demonstrations do not spread at all given E, so nothing says which directions to trust; use "
-                "enforcement.metric=standardised"
-            )
+
+    @property
+    def size(self) -> int:
+        """d."""
+        return self.deviation.shape[-1]
 
     @classmethod
     def of_demonstrations(
@@ -82,9 +84,12 @@ class Estimate:
 
         Args:
             shrinkage: s in (1 - s) Sigma + s v D^2, with D the deviations of the channels and v the mean variance of
-                D^-1 Sigma D^-1.
+                D^-1 Sigma D^-1, at least LEAST_SPREAD: where demonstrations do not spread, equal variances remain.
             directions: how many leading directions are kept beside a diagonal, which makes long horizons cheap; 0 keeps
                 all.
+
+        Raises:
+            ConfigError: if demonstrations do not spread at all given E and shrinkage is 0.
         """
         return self._kept((alpha_bar, floor, shrinkage, directions), self._at)
 
@@ -101,6 +106,7 @@ class Estimate:
 
     def _diagonal(self, alpha_bar: float, floor: float) -> Covariance:
         variance = np.einsum("...ii->...i", self.covariance)
+        _check_spread(variance)
         return Covariance.diagonal_of(_posterior(variance, alpha_bar) + floor * variance)
 
     @cached_property
@@ -116,19 +122,30 @@ class Estimate:
     def _at(self, alpha_bar: float, floor: float, shrinkage: float, directions: int) -> Covariance:
         variance, basis = self._spectrum(shrinkage)
         remaining = _posterior(variance, alpha_bar) + floor * variance
-        C = Covariance(np.zeros(basis.shape[:-1]), basis * np.sqrt(remaining)[..., None, :])
-        return C.leading(directions) if directions else C
+        if directions:
+            return Covariance.of_spectrum(remaining, basis, directions)
+        return Covariance(np.zeros(basis.shape[:-1]), basis * np.sqrt(remaining)[..., None, :])
 
     def _spectrum(self, shrinkage: float) -> tuple[np.ndarray, np.ndarray]:
         """Variances (*robots, d) and directions (*robots, d, d) of Sigma after shrinkage."""
         if shrinkage not in self._spectra:
             across = self.covariance / self.deviation[:, None] / self.deviation
-            mean = np.einsum("...ii->...", across) / len(self.deviation)
+            mean = np.maximum(np.einsum("...ii->...", across) / len(self.deviation), LEAST_SPREAD)
             equal = mean[..., None, None] * np.diag(self.deviation**2)
             values, vectors = np.linalg.eigh((1 - shrinkage) * self.covariance + shrinkage * equal)
             rounding = values.shape[-1] * np.finfo(np.float64).eps * values[..., -1:]
-            self._spectra[shrinkage] = np.where(values > rounding, values, 0), vectors
+            values = np.where(values > rounding, values, 0)
+            _check_spread(values)
+            self._spectra[shrinkage] = values, vectors
         return self._spectra[shrinkage]
+
+
+def _check_spread(variance: np.ndarray) -> None:
+    if not variance.any(axis=-1).all():
+        raise ConfigError(
+            "estimate: demonstrations do not spread at all given E, so nothing says which directions to trust; use "
+            "enforcement.shrinkage > 0, or enforcement.metric=standardised"
+        )
 
 
 def _posterior(variance: np.ndarray, alpha_bar: float) -> np.ndarray:

@@ -82,17 +82,21 @@ class Covariance:
         return Covariance(scale**2 * self.diagonal, scale[:, None] * self.factor)
 
     def leading(self, count: int) -> Covariance:
-        """The `count` leading directions of C, and of the others the variances alone: diag(D) + U U' with k = count.
+        """The `count` leading directions of C, and of the others the variances alone; see `of_spectrum`."""
+        return Covariance.of_spectrum(*np.linalg.eigh(self.matrix), count)
+
+    @classmethod
+    def of_spectrum(cls, values: np.ndarray, vectors: np.ndarray, count: int) -> Covariance:
+        """diag(D) + U U' with U of k = count columns, from rising eigenvalues (*batch, d) and eigenvectors.
 
         The variance of every entry is kept. As in probabilistic PCA, U takes of each direction what exceeds the mean
         of the others, so that equal variances beside that many directions are kept as they are.
         """
-        values, vectors = np.linalg.eigh(self.matrix)
-        others = values[..., : self.size - count].mean(axis=-1, keepdims=True) if count < self.size else 0.0
-        leading = np.maximum(values[..., self.size - count :] - others, 0)
-        factor = vectors[..., self.size - count :] * np.sqrt(leading)[..., None, :]
-        rest = np.einsum("...ii->...i", self.matrix) - np.square(factor).sum(axis=-1)
-        return Covariance(np.maximum(rest, 0), factor)
+        first = values.shape[-1] - count
+        others = values[..., :first].mean(axis=-1, keepdims=True) if first > 0 else 0.0
+        factor = vectors[..., first:] * np.sqrt(np.maximum(values[..., first:] - others, 0))[..., None, :]
+        variance = np.einsum("...ik,...k,...ik->...i", vectors, values, vectors, optimize=True)
+        return cls(np.maximum(variance - np.square(factor).sum(axis=-1), 0), factor)
 
     def given(self, places: Sequence[int] | np.ndarray) -> tuple[Covariance, np.ndarray]:
         """What is left once entries E z (k,) are known, and the gain with which they move the others.

@@ -54,14 +54,19 @@ def semidefinite_root(M: np.ndarray) -> np.ndarray:
     return vectors * np.sqrt(np.maximum(values, 0))[..., None, :]
 
 
-def semidefinite_inverse(M: np.ndarray) -> np.ndarray:
+def semidefinite_inverse(M: np.ndarray, rounding: np.ndarray | float = 0.0) -> np.ndarray:
     """M^+ of a symmetric positive semidefinite M (..., d, d), after its rows are scaled to a diagonal of 1.
 
     Scaling makes the one rank rule independent of units.
+
+    Args:
+        rounding: (..., d), what an entry of the diagonal may be that is 0 but for rounding; such rows count as 0.
     """
-    size = np.sqrt(np.einsum("...ii->...i", M))
-    scale = np.where(size > 0, size, 1.0)
+    size = np.einsum("...ii->...i", M)
+    some = size > rounding
+    scale = np.sqrt(np.where(some, size, 1.0))
     across = scale[..., :, None] * scale[..., None, :]
+    M = np.where(some[..., :, None] & some[..., None, :], M, 0.0)
     return np.linalg.pinv(M / across, rcond=M.shape[-1] * np.finfo(np.float64).eps, hermitian=True) / across
 
 
