@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from dadiff.denoisers.exact import ExactParts
 from dadiff.diffusion.chain import predict
 from dadiff.diffusion.context import Context, Counted, unprojected
 from dadiff.diffusion.enforcement import Enforcement, Never
@@ -167,10 +168,10 @@ def law_of_plans(planner: Planner, environment: np.ndarray) -> tuple[Gaussian, i
 
 def _prior(planner: Planner, environment: np.ndarray) -> Gaussian:
     """The law that the exact denoiser is made from, given E, in the sampler's coordinates."""
-    law = getattr(planner.denoiser.made_from, "law", None)
-    if law is None:
+    parts = planner.denoiser.made_from
+    if not isinstance(parts, ExactParts):
         raise NotApplicableError("exact: the denoiser is trained, and its law not known; use denoiser=gaussian")
-    where = planner.coordinates
+    law, where = parts.law, planner.coordinates
     mean = where.to_scaled(law.mean(environment)).reshape(-1)
     noise_map = law.noise_map.reshape(-1, law.noise_map.shape[-1]) / where.scale[:, None]
     return Gaussian(mean, noise_map @ noise_map.T)
@@ -188,6 +189,7 @@ def _operators(planner: Planner, environment: np.ndarray) -> Iterator[tuple[Oper
 
 def _step(planner: Planner, environment: np.ndarray, by: Enforcement, step: Step, *, end: bool = False) -> Operator:
     def operator(tau: Tensor, before: Tensor, noise: Callable[[], Tensor]) -> tuple[Tensor, Tensor]:
+        """Of rows (B, d) each; a draw of noise is asked for as often as the step takes one."""
         shape = (*planner.system.robots, *tau.shape)
         E = np.broadcast_to(environment, (*shape[:-1], environment.shape[-1]))
         at = Context(

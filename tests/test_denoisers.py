@@ -18,7 +18,7 @@ from dadiff.denoisers.prediction import loss_weights, prediction
 from dadiff.denoisers.recipes import Recipe
 from dadiff.diffusion.schedule import Schedule, cosine, ddpm_linear, paper_linear
 from dadiff.errors import CheckpointError, ConfigError, ShapeError
-from dadiff.experts.lqr import closed_loop_law, optimal_feedback
+from dadiff.experts.lqr import ClosedLoopLaw, optimal_feedback
 from dadiff.randomness import numpy_generator, torch_generator
 from dadiff.systems import Linear, double_integrator
 from dadiff.trajectory import Channel, Layout, TrajectoryLayout
@@ -129,7 +129,7 @@ def test_exact_denoiser_is_the_conditional_mean(schedule):
 def test_exact_denoiser_of_the_lqr_law():
     """Its covariance is singular: x(0) is given, u(0) deterministic and u(T-1) = 0."""
     system = double_integrator(process_noise=0.02)
-    law = closed_loop_law(system, optimal_feedback(system, np.eye(4), np.eye(2), 5))
+    law = ClosedLoopLaw(system, optimal_feedback(system, np.eye(4), np.eye(2), 5))
     layout, schedule = system.layout(5), paper_linear()
     denoiser = Gaussian().exact(law, physical(layout), schedule)
     z, E = draw(layout.size), draw(8, seed=1)
@@ -325,6 +325,6 @@ def test_a_system_of_another_size():
     """Nothing assumes four states and two inputs."""
     rng = numpy_generator(0, "system")
     system = Linear(0.5 * rng.standard_normal((3, 3)), rng.standard_normal((3, 2)), process_noise=0.1)
-    law = closed_loop_law(system, optimal_feedback(system, np.eye(3), np.eye(2), 5))
+    law = ClosedLoopLaw(system, optimal_feedback(system, np.eye(3), np.eye(2), 5))
     denoiser = Gaussian().exact(law, random_coordinates(), paper_linear())
     assert denoiser(draw(4, LAYOUT.size), 10, draw(6)).shape == (4, LAYOUT.size)

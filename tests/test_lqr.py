@@ -14,7 +14,7 @@ from dadiff.datasets import Generated
 from dadiff.errors import ConfigError, InfeasibleError, NotApplicableError
 from dadiff.evaluation import replay
 from dadiff.evaluation.errors import dynamics_residual
-from dadiff.experts.lqr import closed_loop_law, follow, optimal_feedback, stationary_feedback
+from dadiff.experts.lqr import ClosedLoopLaw, follow, optimal_feedback, stationary_feedback
 from dadiff.randomness import numpy_generator
 from dadiff.systems import AffineSystem, Bounds, DampedIntegrators, Linear, double_integrator
 from dadiff.tasks import LQR, Fleet
@@ -122,13 +122,13 @@ def test_the_stationary_expert_steers_by_the_deviation_from_the_target(system):
 @pytest.mark.parametrize("solve", [optimal_feedback, stationary_feedback])
 def test_a_fleet_is_its_robots_one_by_one(solve):
     robots, (Q, R) = fleet(), (np.diag([3.0, 2.0, 1.0]), np.eye(2))
-    together, law = solve(robots, Q, R, 8), closed_loop_law(robots, solve(robots, Q, R, 8))
+    together, law = solve(robots, Q, R, 8), ClosedLoopLaw(robots, solve(robots, Q, R, 8))
     for k, robot in enumerate(members(robots)):
         alone = solve(robot, Q, R, 8)
         np.testing.assert_allclose(together.K[k], alone.K, atol=1e-12)
         np.testing.assert_allclose(together.L[k], alone.L, atol=1e-12)
-        np.testing.assert_allclose(law.mean_map[k], closed_loop_law(robot, alone).mean_map, atol=1e-12)
-        np.testing.assert_allclose(law.noise_map[k], closed_loop_law(robot, alone).noise_map, atol=1e-12)
+        np.testing.assert_allclose(law.mean_map[k], ClosedLoopLaw(robot, alone).mean_map, atol=1e-12)
+        np.testing.assert_allclose(law.noise_map[k], ClosedLoopLaw(robot, alone).noise_map, atol=1e-12)
 
 
 def test_a_horizon_that_overflows_is_an_infeasible_problem():

@@ -15,6 +15,7 @@ import pandas as pd
 import pytest
 from safetensors.numpy import save as arrays_to_bytes
 
+import dadiff
 from dadiff.behaviours import HankelLowRank, IdentifiedSoft, Inpainting, Known, TrajectorySet
 from dadiff.denoisers import MLP, Gaussian
 from dadiff.diffusion.conditional import Conditional
@@ -275,6 +276,43 @@ def test_a_stored_run_is_a_planner_that_gives_the_runs_plans(tmp_path):
     moved = Planner.load(loaded.save(tmp_path / "robot.zip"))
     (tmp_path / "out").rename(tmp_path / "gone")
     np.testing.assert_array_equal(moved.plan(loaded.condition.pack(**fields), samples=2, seed=0).states, stored)
+
+
+TINY = [
+    "sampler=ddim", "sampler.num_steps=5", "dataset.train_size=60", "dataset.test_size=2", "evaluation.samples=2",
+    "training.steps=10", "denoiser.width=8", "tracking.enabled=false", "progress=false",
+]  # fmt: skip
+WITHOUT_A_NETWORK = [option for option in TINY if not option.startswith(("training", "denoiser"))]
+RUNS = {
+    "gaussian": [*WITHOUT_A_NETWORK, "denoiser=gaussian", "projector=none"],
+    "moment_matched": [*WITHOUT_A_NETWORK, "denoiser=moment_matched", "projector=hankel_lowrank"],
+    "fleet": [*WITHOUT_A_NETWORK, "denoiser=moment_matched", "task=fleet", "task.robots=40",
+              "system=damped_integrators", "task.interpolation=1", "task.extrapolation=1", "projector=identified"],
+    "regression": [*TINY[2:], "training=regression", "sampler=once"],
+    "closed loop": [*TINY, "evaluation=closed_loop", "evaluation.replan_every=[10]"],
+    "few": [*TINY[2:], "sampler=few", "projector=known_fixed"],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("overrides", RUNS.values(), ids=RUNS)
+def test_every_run_is_a_planner_that_gives_its_plans(tmp_path, monkeypatch, overrides):
+    monkeypatch.setattr("dadiff.evaluation.closed_loop.TIMED_SECONDS", 0.0)
+    run = dadiff.run([*overrides, f"output_dir={tmp_path}/out"])
+    moved = Planner.load(Planner.load(run.folder).save(tmp_path / "robot.zip"))
+    with np.load(run.folder / "examples.npz") as examples:
+        shown = np.argsort(examples["robots"]) if "robots" in examples else Ellipsis
+        E = moved.condition.pack(**{name: examples[f"environment_{name}"] for name in moved.condition.names})
+        stored = examples["states"]
+    (tmp_path / "out").rename(tmp_path / "gone")
+    np.testing.assert_array_equal(moved.plan(E[shown], samples=2, seed=0).states, stored[shown])
+
+
+def test_the_file_of_a_known_law_holds_what_it_is_made_from(tmp_path):
+    """Not its maps, which for n = 40 and T = 100 have 145 MB: the system and the expert's gains."""
+    one = planner()
+    law_bytes = TASK.law(SYSTEM).noise_map.nbytes
+    assert one.save(tmp_path / "robot.zip").stat().st_size < law_bytes
+    np.testing.assert_array_equal(plan_of(Planner.load(tmp_path / "robot.zip")).tau, plan_of(one).tau)
 
 
 def test_errors_are_dadiffs_own(tmp_path):

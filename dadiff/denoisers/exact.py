@@ -33,6 +33,8 @@ class Law(Protocol):
     @property
     def noise_map(self) -> np.ndarray: ...
 
+    def mean(self, ends: np.ndarray) -> np.ndarray: ...
+
 
 class ExactDenoiser:
     """The posterior mean in scaled coordinates z = D^-1 (tau - mean).

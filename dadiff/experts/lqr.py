@@ -146,11 +146,26 @@ def stationary_feedback(system: AffineSystem, Q: np.ndarray, R: np.ndarray, hori
     return AffineFeedback(K, -K, np.zeros(K.shape[:-1]))
 
 
-def closed_loop_law(system: AffineSystem, feedback: AffineFeedback) -> GaussianLaw:
-    """The law of trajectories under the feedback and process noise.
+@dataclass(frozen=True)
+class ClosedLoopLaw(GaussianLaw):
+    """The law of trajectories under a feedback and process noise, made from no more than the two."""
 
-    Propagates the linear maps from [x_init; x_target; w(0:T-1)] to x(t) and u(t).
-    """
+    system: AffineSystem
+    feedback: AffineFeedback
+    mean_map: np.ndarray = field(init=False, repr=False)
+    offset: np.ndarray = field(init=False, repr=False)
+    noise_map: np.ndarray = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        ends, n = np.zeros((*self.system.robots, self.system.state_dim)), 2 * self.system.state_dim
+        maps = _propagated(self.system, self.feedback)
+        found = {"mean_map": maps[..., :n], "offset": follow(self.system, self.feedback, ends, ends)}
+        for name, array in {**found, "noise_map": maps[..., n:]}.items():
+            object.__setattr__(self, name, array)
+
+
+def _propagated(system: AffineSystem, feedback: AffineFeedback) -> np.ndarray:
+    """The linear map from [x_init; x_target; w(0:T-1)] to tau, (*robots, d, 2n + nT)."""
     T, n, m = feedback.horizon, system.state_dim, system.input_dim
     A, B, _ = system.matrices(T)
     num_sources = 2 * n + n * T
@@ -166,9 +181,7 @@ def closed_loop_law(system: AffineSystem, feedback: AffineFeedback) -> GaussianL
         noise = 2 * n + n * t
         states[..., t + 1, :, noise : noise + n] += np.diag(np.broadcast_to(system.process_noise, n))
     by_source = system.layout(T).flatten(np.moveaxis(states, -1, -3), np.moveaxis(inputs, -1, -3))
-    maps = by_source.swapaxes(-1, -2)
-    rest = np.zeros((*system.robots, n))
-    return GaussianLaw(maps[..., : 2 * n], follow(system, feedback, rest, rest), maps[..., 2 * n :])
+    return by_source.swapaxes(-1, -2)
 
 
 def follow(

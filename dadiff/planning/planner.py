@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import torch
@@ -34,12 +34,18 @@ from dadiff.trajectory.layout import Layout, TrajectoryLayout
 
 if TYPE_CHECKING:
     from dadiff.behaviours import Projector
+    from dadiff.denoisers.encoded import EncodedParts
+    from dadiff.denoisers.exact import ExactParts
+    from dadiff.denoisers.learned import NetworkParts
 
 
 class Denoiser(Protocol):
     """A denoiser that can be stored: trained, or exact."""
 
-    made_from: Any
+    @property
+    def made_from(self) -> NetworkParts | EncodedParts | ExactParts:
+        """All but its weights."""
+        ...
 
     def __call__(self, tau: torch.Tensor, i: int, environment: torch.Tensor) -> torch.Tensor: ...
 

@@ -190,8 +190,8 @@ def _store(experiment: Experiment, plans: Plans, started: float) -> StoredRun:
         counts=_counts(experiment),
     )
     files = {"config.yaml": yaml.safe_dump(passwords_removed(experiment.config), sort_keys=False).encode()}
-    if trained := experiment.identity.denoiser:
-        files |= in_folder(experiment.planner, trained.key)
+    trained = experiment.identity.denoiser
+    files |= in_folder(experiment.planner, trained.key if trained else None)
     return experiment.results.write(record, files=files, tables=written, arrays=arrays)
 
 

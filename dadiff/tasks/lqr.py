@@ -11,8 +11,8 @@ import numpy as np
 from dadiff.errors import ConfigError, NotApplicableError
 from dadiff.experts.lqr import (
     AffineFeedback,
+    ClosedLoopLaw,
     GaussianLaw,
-    closed_loop_law,
     follow,
     optimal_feedback,
     stationary_feedback,
@@ -121,7 +121,7 @@ class LQR:
 
     def law(self, system: AffineSystem) -> GaussianLaw:
         """The Gaussian law of demonstrations given E."""
-        return closed_loop_law(system, self.feedback(system))
+        return ClosedLoopLaw(system, self.feedback(system))
 
     def sample_environments(self, system: AffineSystem, shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
         """E of shape (*shape, 2n)."""

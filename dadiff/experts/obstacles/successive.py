@@ -39,6 +39,7 @@ class _Program:
 
     @classmethod
     def of(cls, problem: ObstacleProblem) -> _Program:
+        """For problems of this horizon and number of discs."""
         import cvxpy as cp
 
         T, discs = problem.horizon, problem.radius.shape[1]
