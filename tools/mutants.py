@@ -1,168 +1,218 @@
-"""Mutants: small faults put into the core one at a time, each of which the tests of its room must find.
+"""Mutants: small faults put into the core one at a time, each of which a test must find.
 
-    .venv/bin/python tools/mutants.py [--seconds 900] [--seed 0] [room ...]
+    .venv/bin/python tools/mutants.py [--count 120] [--seconds 900] [--seed 0] [--only dadiff/diffusion/chain.py]
 
-Operators, comparisons, numbers, conditions and flags are changed, one in each mutant, in an order drawn from the seed
-until the time is over. A mutant lives in a forked process alone, where its module is loaded from the changed source.
-Those that no test finds are listed; those that `tools/mutants.txt` explains are not counted.
-Leaves with exit code 1 if fewer than 95 % are found.
+The tests are collected once. Which of them come to which line, and how long they take, is measured once and kept for
+files that stay the same. Each mutant is a fork of this process in which the code of one function is replaced; it runs
+the tests that come to the changed line, the quickest first, until one fails. So most cost less than a second.
+Compiled loops run as plain Python. A mutant that no test finds has survived, and is listed; those that
+`tools/mutants.txt` explains are not counted. Leaves with exit code 1 if fewer than 95 % are found.
 """
 
 from __future__ import annotations
 
 import argparse
-import ast
-import copy
-import importlib.abc
-import importlib.util
+import gc
+import hashlib
+import importlib
+import json
 import os
 import random
-import signal
+import resource
 import sys
+import tempfile
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from types import FunctionType
 
-ROOT = Path(__file__).parent.parent
+os.environ |= {"NUMBA_DISABLE_JIT": "1", "OMP_NUM_THREADS": "1"}
+
+import coverage
+import pytest
+from _pytest.runner import runtestprotocol
+from faults import ROOT, Fault, faults
+
+ENOUGH = 0.95
+LONGEST, BUDGET = 15.0, 40.0  # processor seconds of a test that is used at all, and of all tests for one mutant
+ROOMS = ("trajectory", "behaviours", "diffusion", "denoisers", "experts", "tasks")
+TESTS = """layout response hankel subspace covariance systems nonlinear features flat physics
+    behaviours bounded clear manifold family enforcement conditional rivals exact
+    samplers schedules silence theorem1 denoisers training encodings
+    lqr fleet ilqr obstacle_solver obstacle_experts obstacle_files obstacle_task manoeuvre
+    evaluation control closed_loop planning datasets"""
 REASONS = Path(__file__).with_suffix(".txt")
-ENOUGH, LIMIT = 0.95, 300
-TESTS = {
-    "trajectory": "layout response hankel subspace covariance systems",
-    "behaviours": "behaviours enforcement conditional",
-    "diffusion": "samplers schedules silence enforcement theorem1 conditional",
-    "denoisers": "denoisers training samplers encodings",
-    "experts": "lqr obstacle_solver obstacle_experts ilqr",
-    "tasks": "lqr fleet obstacle_task obstacle_files encodings evaluation",
-}
-SWAPS: dict[type, type] = {
-    ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.Pow: ast.Mult, ast.Lt: ast.LtE,
-    ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq, ast.And: ast.Or,
-    ast.Or: ast.And,
-}  # fmt: skip
+KEPT = ROOT / ".pytest_cache" / "mutants"
 
 
-@dataclass(frozen=True)
-class Mutant:
-    """One change of one file.
+@dataclass
+class Seen:
+    """What tests come to.
 
     Args:
-        place: of the changed node in the order of `ast.walk`.
+        seconds: of each test, by its name.
+        lines: file -> line -> names of the tests that come there.
     """
 
-    file: Path
-    place: int
-    line: int
-    change: str
+    seconds: dict[str, float] = field(default_factory=dict)
+    lines: dict[str, dict[str, list[str]]] = field(default_factory=dict)
+    failed: list[str] = field(default_factory=list)
 
-    @property
-    def name(self) -> str:
-        """File, line of code and change: what a reason is listed under."""
-        code = self.file.read_text().splitlines()[self.line - 1].strip()
-        return f"{self.file.relative_to(ROOT)} | {code} | {self.change}"
+    def add(self, other: Seen) -> None:
+        """Those of another file of tests."""
+        self.seconds |= other.seconds
+        self.failed += other.failed
+        for file, lines in other.lines.items():
+            for line, tests in lines.items():
+                self.lines.setdefault(file, {}).setdefault(line, []).extend(tests)
 
-    def source(self) -> ast.Module:
-        """The changed module."""
-        tree = ast.parse(self.file.read_text())
-        node = list(ast.walk(tree))[self.place]
-        mutate(node)
-        return ast.fix_missing_locations(tree)
-
-
-def mutate(node: ast.AST) -> str | None:
-    """Change a node in place; returns what was done, None if there is nothing to change."""
-    if isinstance(node, (ast.BinOp, ast.BoolOp, ast.AugAssign)) and type(node.op) in SWAPS:
-        before, node.op = type(node.op), SWAPS[type(node.op)]()
-        return f"{before.__name__} -> {type(node.op).__name__}"
-    if isinstance(node, ast.Compare) and type(node.ops[0]) in SWAPS:
-        before, node.ops[0] = type(node.ops[0]), SWAPS[type(node.ops[0])]()
-        return f"{before.__name__} -> {type(node.ops[0]).__name__}"
-    if isinstance(node, ast.Constant) and isinstance(node.value, (bool, int, float)):
-        before = node.value
-        node.value = (not before) if isinstance(before, bool) else before + 1 if isinstance(before, int) else 2 * before
-        return f"{before} -> {node.value}" if node.value != before else None
-    if isinstance(node, (ast.If, ast.IfExp)):
-        node.test = ast.UnaryOp(ast.Not(), node.test)
-        return "condition -> not"
-    if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub):
-        node.op = ast.UAdd()
-        return "minus -> plus"
-    return None
+    def tests(self, fault: Fault) -> list[str]:
+        """Those that come to a fault's line, or else to its statement, or else to its function; the quickest first."""
+        known = self.lines.get(str(fault.file.relative_to(ROOT)), {})
+        for lines in ([fault.line], fault.lines, fault.function):
+            if found := {test for line in lines for test in known.get(str(line), [])}:
+                return within(BUDGET, sorted(found, key=self.seconds.__getitem__), self.seconds)
+        return []
 
 
-def mutants(file: Path) -> Iterator[Mutant]:
-    """All of a file. Messages, types, defaults of parameters and what only a type checker reads are left alone."""
-    tree = ast.parse(file.read_text())
-    left_alone = {id(inner) for node in ast.walk(tree) for outer in unread(node) for inner in ast.walk(outer)}
-    for place, node in enumerate(ast.walk(tree)):
-        if id(node) not in left_alone and (change := mutate(copy.deepcopy(node))):
-            yield Mutant(file, place, getattr(node, "lineno", 1), change)
+def within(budget: float, tests: Sequence[str], seconds: dict[str, float]) -> list[str]:
+    """As many as fit into the budget, and each short enough."""
+    chosen, spent = [], 0.0
+    for test in tests:
+        spent += seconds[test]
+        if spent > budget or seconds[test] > LONGEST:
+            break
+        chosen.append(test)
+    return chosen
 
 
-def unread(node: ast.AST) -> list[ast.AST]:
-    """Parts of a node whose changes no test should have to find."""
-    if isinstance(node, (ast.Raise, ast.JoinedStr)):
-        return [node]
-    if isinstance(node, (ast.FunctionDef, ast.arguments)):
-        return [part for part in ast.iter_child_nodes(node) if isinstance(part, ast.arguments)] + (
-            [node.returns] if isinstance(node, ast.FunctionDef) and node.returns else []
-        )
-    if isinstance(node, ast.AnnAssign):
-        return [node.annotation, *([node.value] if isinstance(node.value, ast.Constant) else [])]
-    if isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING":
-        return [node]
-    return []
+@dataclass
+class Judge:
+    """Takes the place of pytest's loop over tests."""
+
+    given: argparse.Namespace
+    code: int = 1
+
+    def pytest_runtestloop(self, session: pytest.Session) -> bool:
+        """Measure what is not kept, then try mutants."""
+        items = {item.nodeid: item for item in session.items}
+        for module in modules():
+            importlib.import_module(module)
+        seen = all_seen(items)
+        for name in seen.failed:
+            print(f"fails without any mutant, and is not used: {name}")
+        self.code = judge(queue(self.given), seen, items, self.given)
+        return True
 
 
-class Changed(importlib.abc.MetaPathFinder, importlib.abc.Loader):
-    """Loads one module from a changed source."""
-
-    def __init__(self, mutant: Mutant) -> None:
-        path = mutant.file.relative_to(ROOT).with_suffix("")
-        self.name, self.mutant = ".".join(path.parts).removesuffix(".__init__"), mutant
-
-    def find_spec(self, name, path=None, target=None):  # type: ignore[no-untyped-def]
-        """The spec of the one module."""
-        found = name == self.name
-        return importlib.util.spec_from_file_location(name, self.mutant.file, loader=self) if found else None
-
-    def create_module(self, spec):  # type: ignore[no-untyped-def]
-        """As usual."""
-        return None
-
-    def exec_module(self, module):  # type: ignore[no-untyped-def]
-        """Run the changed source."""
-        exec(compile(self.mutant.source(), str(self.mutant.file), "exec"), module.__dict__)
+def modules() -> Iterator[str]:
+    """Of the rooms, so that what is imported late is there to be changed."""
+    for room in ROOMS:
+        for file in sorted((ROOT / "dadiff" / room).rglob("*.py")):
+            yield ".".join(file.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
 
 
-def survives(mutant: Mutant | None, files: list[str]) -> bool:
-    """Whether all tests pass, in a process of its own; one that takes too long does not survive."""
+def all_seen(items: dict[str, pytest.Item]) -> Seen:
+    """Of all tests, measured now where the core or the test has changed since the last time."""
+    KEPT.mkdir(parents=True, exist_ok=True)
+    core, seen = digest(sorted((ROOT / "dadiff").rglob("*.py"))), Seen()
+    for test in sorted({item.path for item in items.values()}):
+        kept = KEPT / f"{test.stem}-{core}-{digest([test])}.json"
+        if not kept.is_file():
+            began = time.monotonic()
+            in_fork(lambda test=test, kept=kept: measure([i for i in items.values() if i.path == test], kept))
+            print(f"measured {test.stem} in {time.monotonic() - began:.0f} s", flush=True)
+        seen.add(Seen(**json.loads(kept.read_text())))
+    return seen
+
+
+def digest(files: Sequence[Path]) -> str:
+    """Of what the files hold."""
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:12]
+
+
+def measure(items: Sequence[pytest.Item], kept: Path) -> bool:
+    """Run tests, and write to which lines each of them comes."""
+    seen = Seen()
+    watch = coverage.Coverage(data_file=None, include=[str(ROOT / "dadiff" / room / "*") for room in ROOMS])
+    watch.start()
+    for item, after in zip(items, [*items[1:], None], strict=True):
+        watch.switch_context(item.nodeid)
+        began = time.process_time()
+        if not passes(item, after):
+            seen.failed.append(item.nodeid)
+        seen.seconds[item.nodeid] = time.process_time() - began
+    watch.stop()
+    data = watch.get_data()
+    for file in data.measured_files():
+        lines = {str(k): sorted(set(tests) - {"", *seen.failed}) for k, tests in data.contexts_by_lineno(file).items()}
+        seen.lines[str(Path(file).relative_to(ROOT))] = {line: tests for line, tests in lines.items() if tests}
+    kept.write_text(json.dumps(vars(seen)))
+    return True
+
+
+def passes(item: pytest.Item, after: pytest.Item | None) -> bool:
+    """Whether a test passes, or is skipped."""
+    return not any(report.failed for report in runtestprotocol(item, nextitem=after, log=False))
+
+
+def queue(given: argparse.Namespace) -> list[Fault]:
+    """Mutants in an order drawn from the seed, without those that are explained."""
+    explained = reasons()
+    found = [
+        fault
+        for room in ROOMS
+        for file in sorted((ROOT / "dadiff" / room).rglob("*.py"))
+        if given.only in str(file.relative_to(ROOT))
+        for fault in faults(file)
+    ]
+    random.Random(given.seed).shuffle(found)
+    return [fault for fault in found if fault.name not in explained]
+
+
+def judge(found: Sequence[Fault], seen: Seen, items: dict[str, pytest.Item], given: argparse.Namespace) -> int:
+    """Try mutants until there are enough or the time is over, and say how many lived."""
+    began, tried, alive = time.monotonic(), 0, 0
+    for fault in found[: given.count]:
+        if time.monotonic() - began > given.seconds:
+            break
+        tried += 1
+        tests = [items[name] for name in seen.tests(fault)]
+        if in_fork(lambda fault=fault, tests=tests: survives(fault, tests)):
+            alive += 1
+            print(f"survived {len(tests)} tests, line {fault.line}: {fault.name}", flush=True)
+    killed = tried - alive
+    print(
+        f"{killed} of {tried} mutants found ({killed / max(tried, 1):.1%}), drawn with seed {given.seed} from "
+        f"{len(found)}; {time.monotonic() - began:.0f} s"
+    )
+    return int(killed < ENOUGH * tried)
+
+
+def survives(fault: Fault, tests: Sequence[pytest.Item]) -> bool:
+    """Whether all tests pass with the fault in place."""
+    codes = fault.codes()
+    for function in gc.get_objects():
+        if type(function) is FunctionType and function.__code__.co_filename == str(fault.file):
+            code = function.__code__
+            function.__code__ = codes.get((code.co_qualname, code.co_firstlineno), code)
+    return all(passes(item, after) for item, after in zip(tests, [*tests[1:], None], strict=True))
+
+
+def in_fork(work: Callable[[], bool]) -> bool:
+    """What a function says in a process of its own; False if it fails, or takes much more than the budget."""
     child = os.fork()
-    if child == 0:
-        os.setpgrp()
-        with open(os.devnull, "w") as nothing:
-            os.dup2(nothing.fileno(), 1)
-            os.dup2(nothing.fileno(), 2)
-        if mutant is not None:
-            sys.meta_path.insert(0, Changed(mutant))
-        import pytest
-
-        arguments = ["-x", "-q", "-p", "no:cacheprovider", "-m", "not slow", *files]
-        os._exit(int(pytest.main(arguments)))
-    deadline = time.monotonic() + LIMIT
-    while time.monotonic() < deadline:
-        pid, status = os.waitpid(child, os.WNOHANG)
-        if pid:
-            return os.waitstatus_to_exitcode(status) == 0
-        time.sleep(0.05)
-    os.killpg(child, signal.SIGKILL)
-    os.waitpid(child, 0)
-    return False
-
-
-def tests(room: str) -> list[str]:
-    """The files that must find the mutants of a room."""
-    return [str(ROOT / "tests" / f"test_{name}.py") for name in TESTS[room].split()]
+    if child:
+        return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+    try:
+        resource.setrlimit(resource.RLIMIT_CPU, (int(20 * BUDGET), int(20 * BUDGET)))
+        nothing = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nothing, 1)
+        os.dup2(nothing, 2)
+        os._exit(0 if work() else 1)
+    finally:
+        os._exit(2)
 
 
 def reasons() -> dict[str, str]:
@@ -174,53 +224,18 @@ def reasons() -> dict[str, str]:
 def main() -> int:
     """The command line; returns its exit code."""
     parser = argparse.ArgumentParser("mutants", description="Which faults put into the core do the tests not find?")
-    parser.add_argument("rooms", nargs="*", default=list(TESTS), help=f"of {', '.join(TESTS)}")
-    parser.add_argument("--seconds", type=float, default=900.0, help="when to stop (900)")
+    parser.add_argument("--count", type=int, default=120, help="how many (120)")
+    parser.add_argument("--seconds", type=float, default=900.0, help="when to stop in any case (900)")
     parser.add_argument("--seed", type=int, default=0, help="of the order (0)")
     parser.add_argument("--only", default="", help="files whose path contains this")
-    given = parser.parse_args()
+    parser.add_argument("--tests", nargs="*", default=TESTS.split(), help="names of test files")
+    judge = Judge(parser.parse_args())
     sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
-    import hypothesis  # noqa: F401  # before the fork, since they take long
-    import torch
-
-    torch.set_num_threads(1)
-    return judge(list(queue(given.rooms, given.only, given.seed)), given.seconds)
-
-
-def queue(rooms: list[str], only: str, seed: int) -> list[tuple[str, Mutant]]:
-    """(room, mutant) in an order drawn from the seed."""
-    found = [
-        (room, mutant)
-        for room in rooms
-        for file in sorted((ROOT / "dadiff" / room).rglob("*.py"))
-        if only in str(file)
-        for mutant in mutants(file)
-    ]
-    random.Random(seed).shuffle(found)
-    return found
-
-
-def judge(found: list[tuple[str, Mutant]], seconds: float) -> int:
-    """Try mutants until the time is over, and say how many lived."""
-    for room in {room for room, _ in found}:
-        if not survives(None, tests(room)):
-            print(f"the tests of {room} fail without any mutant: run them first")
-            return 1
-    explained, begun, killed, alive = reasons(), time.monotonic(), 0, []
-    for room, mutant in found:
-        if time.monotonic() - begun > seconds:
-            break
-        if mutant.name in explained:
-            continue
-        if survives(mutant, tests(room)):
-            alive.append(mutant.name)
-            print(f"survived  {mutant.file.relative_to(ROOT)}:{mutant.line}  {mutant.name}", flush=True)
-        else:
-            killed += 1
-    tried = killed + len(alive)
-    print(f"{killed} of {tried} mutants found ({killed / max(tried, 1):.0%}), of {len(found)} that there are")
-    return int(killed < ENOUGH * tried)
+    with tempfile.TemporaryDirectory() as folder:
+        files = [str(ROOT / "tests" / f"test_{name}.py") for name in judge.given.tests]
+        options = ["-s", "-q", "-p", "no:cacheprovider", "-p", "no:timeout", f"--basetemp={folder}/pytest"]
+        pytest.main([*options, *files], plugins=[judge])
+    return judge.code
 
 
 if __name__ == "__main__":
