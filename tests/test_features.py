@@ -98,7 +98,7 @@ def test_what_makes_no_sense_is_refused(rng):
         (lambda: Features(3, 2, ("trigonometric",), (3,)), "the states are 0 to 2"),
         (lambda: Identified(ridge=1.0), "angles and ridge are of features"),
         (lambda: Identified(ridge=-1.0), "ridge is -1"),
-        (lambda: Identified(features=("identity",), offset="estimated"), "the offset is one of them"),
+        (lambda: Identified(features=("identity",), offset="known"), "the offset is one of them"),
     ]:
         with pytest.raises(ConfigError, match=message):
             make()

@@ -6,14 +6,16 @@ set in physical units; see `dadiff.behaviours.sets`. `initial_state` says whethe
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Literal, Protocol, TypeVar
 
 import numpy as np
 
 from dadiff.behaviours.bounded import Bounded
 from dadiff.behaviours.clear import Clear
+from dadiff.behaviours.hulls import Hull
 from dadiff.behaviours.least_squares import Offset, Transitions, least_squares, lifted, regressed
 from dadiff.behaviours.lifted import Lifted
 from dadiff.behaviours.manifold import Manifold
@@ -23,13 +25,17 @@ from dadiff.behaviours.stages import stages_of
 from dadiff.errors import ConfigError, ExcitationError, NotApplicableError
 from dadiff.systems import AffineSystem, Recording, Robots, System
 from dadiff.systems.features import Features, Term
-from dadiff.trajectory.hankel import identity_length, trajectory_matrix
+from dadiff.trajectory.hankel import identity_length
 from dadiff.trajectory.layout import TrajectoryLayout
-from dadiff.trajectory.subspace import numerical_rank, rank_tolerance
 
 Given = TypeVar("Given")
 LearnFrom = Literal["recording", "demonstrations", "both"]
 BoundsChoice = Literal["ignored", "enforced"]
+
+SMALL_GAP = 2.0
+"""Of singular values s_r / s_{r+1}: below it a truncated Hankel matrix is one of noise as well."""
+
+log = logging.getLogger(__name__)
 
 NOTHING: frozenset[str] = frozenset()
 SYSTEM, RECORDING = frozenset({"system"}), frozenset({"recording"})
@@ -205,11 +211,22 @@ class Hankel:
 
     Process noise gives every column a direction of its own; from d columns on H H† is the identity and the
     projector does nothing. That is refused unless `allow_identity`.
+
+    Args:
+        initial_state: `fixed` holds x(0) = x_init.
+        allow_identity: also where it projects nothing.
+        offset: of the dynamics: `none`; `estimated`: the affine hull of the columns; or `known`: about the system's
+            drift. See `dadiff.behaviours.hulls`.
     """
 
     initial_state: InitialState = "free"
     allow_identity: bool = False
-    needs: ClassVar[frozenset[str]] = RECORDING
+    offset: Offset = "none"
+
+    @property
+    def needs(self) -> frozenset[str]:
+        """A recording, and the system whose offset is known."""
+        return told(RECORDING, self.offset)
 
     def fit(
         self,
@@ -220,25 +237,36 @@ class Hankel:
     ) -> Span:
         """The image of H."""
         recording = _required(recording, "hankel", "recording")
-        U, s, rank = _decompose(recording, layout)
-        if rank == layout.size and not self.allow_identity:
+        hull = Hull.of(recording, layout, self.offset, offsetting(system, self.offset, "hankel"))
+        if hull.rank == layout.size and not self.allow_identity:
+            longest = identity_length(layout, recording.count, spare=int(self.offset == "estimated"))
             raise ExcitationError(
                 f"projector hankel: {recording.count} x S = {recording.length} noisy columns span all d = "
                 f"{layout.size} dimensions, so H H† is the identity and projects nothing; use hankel_lowrank, "
-                f"S < {identity_length(layout, recording.count)}, or projector.allow_identity=true"
+                f"S < {longest}, or projector.allow_identity=true"
             )
-        return Span(layout, U[..., :rank], notes=_notes(s, rank))
+        return hull.span(hull.rank)
 
 
 @dataclass(frozen=True)
 class HankelLowRank:
     """P = U U' with U the n + mT leading left singular vectors of the stacked Hankel matrix.
 
-    The stack is truncated, not H(u) alone: under process noise its best approximation of the dynamics' rank.
+    The stack is truncated, not H(u) alone: under process noise its best approximation of the dynamics' rank, each
+    channel scaled to one size.
+
+    Args:
+        initial_state: `fixed` holds x(0) = x_init.
+        offset: as of `Hankel`.
     """
 
     initial_state: InitialState = "free"
-    needs: ClassVar[frozenset[str]] = RECORDING
+    offset: Offset = "none"
+
+    @property
+    def needs(self) -> frozenset[str]:
+        """A recording, and the system whose offset is known."""
+        return told(RECORDING, self.offset)
 
     def fit(
         self,
@@ -249,8 +277,15 @@ class HankelLowRank:
     ) -> Span:
         """The leading n + mT directions of H."""
         recording = _required(recording, "hankel_lowrank", "recording")
-        U, s, _ = _decompose(recording, layout)
-        return Span(layout, U[..., : layout.rank], notes=_notes(s, layout.rank))
+        hull = Hull.of(recording, layout, self.offset, offsetting(system, self.offset, "hankel_lowrank"))
+        if (gap := hull.gap(layout.rank)) < SMALL_GAP:
+            log.warning(
+                "projector hankel_lowrank: singular value n + mT = %d is only %.3g times the next one: noise is taken "
+                "for dynamics; record longer or with larger inputs, or use projector=identified",
+                layout.rank,
+                gap,
+            )
+        return hull.span(layout.rank)
 
 
 @dataclass(frozen=True)
@@ -284,15 +319,14 @@ class Identified:
             raise ConfigError(f"projector: ridge is {self.ridge}; it must be finite and not negative")
         if not self.features and (self.angles or self.ridge):
             raise ConfigError("projector: angles and ridge are of features, and there are none; name some")
-        if self.features and self.offset != "none":
-            raise ConfigError("projector: with features the offset is one of them; use constant, and offset=none")
+        if self.features and self.offset == "known":
+            raise ConfigError("projector: with features the offset is one of them; use offset=estimated")
 
     @property
     def needs(self) -> frozenset[str]:
         """What it learns from, and the system whose offset or bounds are known."""
         sources = {"recording", "demonstrations"} if self.learn_from == "both" else {self.learn_from}
-        told = self.offset == "known" or self.bounds == "enforced"
-        return frozenset(sources | ({"system"} if told else set()))
+        return told(frozenset(sources), self.offset) | (SYSTEM if self.bounds == "enforced" else NOTHING)
 
     def fit(
         self,
@@ -309,9 +343,10 @@ class Identified:
         data = transitions(self, layout, system, recording, demonstrations)
         notes: dict[str, float] = {"rank": layout.rank}
         if self.features:
-            phi = Features(layout.state_dim, layout.input_dim, self.features, self.angles)
+            terms = with_offset(self.features, self.offset)
+            phi = Features(layout.state_dim, layout.input_dim, terms, self.angles)
             return within(Manifold(layout, regressed(data, phi, self.ridge).system, notes=notes), self.bounds, system)
-        estimate = least_squares(data, self.offset, known_offset(self, system))
+        estimate = least_squares(data, self.offset, known_offset(self.offset, system))
         return within(Dynamics(layout, estimate.stages(layout.horizon), notes=notes), self.bounds, system)
 
 
@@ -348,7 +383,7 @@ class IdentifiedSoft(Identified):
             )
         shown = _required(demonstrations, "identified_soft", "dataset")
         data = transitions(self, layout, system, recording, demonstrations)
-        estimate = least_squares(data, self.offset, known_offset(self, system))
+        estimate = least_squares(data, self.offset, known_offset(self.offset, system))
         spread = estimate.residual_spread(*layout.split(shown))
         deviation = float(np.sqrt(np.square(spread).sum(axis=-1).mean()))
         notes = {"rank": layout.rank, "residual_deviation": deviation}
@@ -360,23 +395,32 @@ class Koopman:
     """Extended dynamic mode decomposition: least squares for psi(x(t+1)) = K psi(x(t)) + B u(t).
 
     Args:
-        features: observables besides the states: constant, trigonometric, products; see `dadiff.systems.features`.
+        features: observables besides the states: trigonometric, products; see `dadiff.systems.features`.
         angles: indices of the states whose sines and cosines are observed.
         ridge: weight of |[K, B]|^2 against the squared residuals, observables scaled to deviation 1.
+        offset: `estimated` observes the constant 1, which carries it; `none` does not; `known` is taken from the
+            transitions of the system's states, for observables that are the states alone.
     """
 
-    needs: ClassVar[frozenset[str]] = RECORDING
     initial_state: ClassVar[InitialState] = "fixed"
 
-    features: Sequence[Term] = ("constant",)
+    features: Sequence[Term] = ()
     angles: Sequence[int] = ()
     ridge: float = 0.0
+    offset: Offset = "estimated"
+
+    @property
+    def needs(self) -> frozenset[str]:
+        """A recording, and the system whose offset is known."""
+        return told(RECORDING, self.offset)
 
     def __post_init__(self) -> None:
         for name in ("features", "angles"):
             object.__setattr__(self, name, tuple(getattr(self, name)))
         if "control_affine" in self.features:
             raise ConfigError("projector koopman: observables are of states alone, and control_affine is of inputs")
+        if self.offset == "known" and self.features:
+            raise ConfigError("projector koopman: observables beside the states carry no known offset; use estimated")
         if not 0 <= self.ridge < np.inf:
             raise ConfigError(f"projector: ridge is {self.ridge}; it must be finite and not negative")
 
@@ -390,8 +434,11 @@ class Koopman:
         """The trajectories of the lifted dynamics."""
         recording = _required(recording, "koopman", "recording")
         data = Transitions.of(recording.states, recording.inputs)
-        psi = Features(layout.state_dim, 0, ("identity", *self.features), self.angles)
-        K, B = lifted(data, psi, self.ridge)
+        psi = Features(layout.state_dim, 0, with_offset(("identity", *self.features), self.offset), self.angles)
+        if (c := known_offset(self.offset, system, "koopman")) is None:
+            K, B = lifted(data, psi, self.ridge)
+        else:
+            K, B = with_constant(*lifted(data.less(c), replace(psi, terms=("identity",)), self.ridge), c)
         return Lifted(layout, psi, K, B, notes={"rank": layout.rank, "observables": psi.count})
 
 
@@ -461,45 +508,33 @@ def within(found: Dynamics | Manifold, bounds: BoundsChoice, system: System | No
     return Bounded.by(found, limits)
 
 
-def known_offset(projector: Identified, system: System | None) -> np.ndarray | None:
+def with_offset(terms: Sequence[Term], offset: Offset) -> tuple[Term, ...]:
+    """The terms, and the constant one where an offset is to be carried."""
+    return tuple(terms) if offset == "none" or "constant" in terms else (*terms, "constant")
+
+
+def with_constant(K: np.ndarray, B: np.ndarray, c: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """K and B of the observables [x; 1] from those of x, and c (*robots, n)."""
+    n = K.shape[-1]
+    above = np.concatenate([K, c[..., None]], axis=-1)
+    below = np.broadcast_to(np.eye(n + 1)[n:], (*K.shape[:-2], 1, n + 1))
+    return np.concatenate([above, below], axis=-2), np.concatenate([B, np.zeros((*B.shape[:-2], 1, B.shape[-1]))], -2)
+
+
+def told(sources: frozenset[str], offset: Offset) -> frozenset[str]:
+    """What a projector needs beside its sources: the system, where it is told the offset."""
+    return sources | SYSTEM if offset == "known" else sources
+
+
+def offsetting(system: System | None, offset: Offset, projector: str) -> System | None:
+    """The system whose offset is known, or None where none is."""
+    return _required(system, projector, "system") if offset == "known" else None
+
+
+def known_offset(offset: Offset, system: System | None, projector: str = "identified") -> np.ndarray | None:
     """c of the system (*robots, n), where the projector is told it."""
-    if projector.offset != "known":
-        return None
-    return stages_of(_required(system, "identified", "system"), 1).c[..., 0, :]
-
-
-def _decompose(recording: Recording, layout: TrajectoryLayout) -> tuple[np.ndarray, np.ndarray, int]:
-    """Left singular vectors, singular values and rank of the stack H.
-
-    Raises:
-        ExcitationError: if x(0) and u(0:T-1) of the windows do not span n + mT dimensions (Willems' condition, which
-            noise cannot feign: under feedback alone u(0) follows from x(0)), or the rank differs between robots.
-    """
-    H = trajectory_matrix(recording.states, recording.inputs, layout)
-    sources = np.concatenate([H[..., layout.initial_state, :], H[..., layout.all_inputs, :]], axis=-2)
-    if (found := numerical_rank(sources)) < layout.rank:
-        raise ExcitationError(
-            f"recording: x(0) and u(0:T-1) of its windows have rank {found}, n + mT = {layout.rank} are needed: the "
-            "inputs do not excite the system; record with inputs that vary independently of the state (not under "
-            "feedback alone)"
-        )
-    U, s, _ = np.linalg.svd(H, full_matrices=False)
-    ranks = (s > rank_tolerance(s, H.shape)).sum(axis=-1)
-    rank = int(ranks.min())
-    if rank < ranks.max():
-        raise ExcitationError(
-            f"recording: the robots' Hankel matrices have ranks from {rank} to {int(ranks.max())}; "
-            "give every robot a recording of the same length and noise"
-        )
-    return U, s, rank
-
-
-def _notes(s: np.ndarray, rank: int) -> dict[str, float]:
-    """Rank, and the gap s_r / s_{r+1} behind it (inf where nothing follows); of a fleet, the smallest gap."""
-    if rank >= s.shape[-1]:
-        return {"rank": rank, "singular_value_gap": float("inf")}
-    with np.errstate(divide="ignore"):
-        return {"rank": rank, "singular_value_gap": float((s[..., rank - 1] / s[..., rank]).min())}
+    given = offsetting(system, offset, projector)
+    return None if given is None else stages_of(given, 1).c[..., 0, :]
 
 
 def _required(value: Given | None, projector: str, what: str) -> Given:

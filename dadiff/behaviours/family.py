@@ -9,13 +9,12 @@ the maximisation takes the mean and the spread of that.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import ClassVar
 
 import numpy as np
 
-from dadiff.behaviours.least_squares import Transitions, least_squares
+from dadiff.behaviours.least_squares import Offset, Transitions, least_squares
 from dadiff.behaviours.sets import InitialState, Uncertain
-from dadiff.behaviours.stages import Stages, transposed
+from dadiff.behaviours.stages import Stages, stages_of, transposed
 from dadiff.errors import ConfigError
 from dadiff.systems import Recording, System
 from dadiff.trajectory.layout import TrajectoryLayout
@@ -41,16 +40,16 @@ class Moments:
     count: int
 
     @classmethod
-    def of(cls, data: Transitions) -> Moments:
-        """Of transitions (..., count, n)."""
-        Phi = np.concatenate([data.x, data.u], axis=-1)
+    def of(cls, data: Transitions, *, constant: bool = False) -> Moments:
+        """Of transitions (..., count, n), with a 1 beside x and u where there is an offset to be found."""
+        Phi = np.concatenate([data.x, data.u, np.ones((*data.x.shape[:-1], int(constant)))], axis=-1)
         Y = data.following
         return cls(transposed(Phi) @ Phi, transposed(Phi) @ Y, np.square(Y).sum(axis=-2), Phi.shape[-2])
 
 
 @dataclass(frozen=True)
 class Belief:
-    """theta ~ N(mean, covariance), theta = [A B]' row by row; a prior, or what is left of it after data.
+    """theta ~ N(mean, covariance), theta = [A B]' or [A B c]' row by row; a prior, or what is left of it after data.
 
     Args:
         mean: (*robots, p n).
@@ -87,23 +86,31 @@ class Belief:
 
     def stages(self, layout: TrajectoryLayout) -> Stages:
         """The mean dynamics, at every stage."""
-        n = layout.state_dim
-        theta = transposed(self.mean.reshape(*self.mean.shape[:-1], n + layout.input_dim, n))
-        return Stages.constant(theta[..., :n], theta[..., n:], None, layout.horizon)
+        n, m = layout.state_dim, layout.input_dim
+        theta = transposed(self.mean.reshape(*self.mean.shape[:-1], -1, n))
+        c = theta[..., n + m] if theta.shape[-1] > n + m else None
+        return Stages.constant(theta[..., :n], theta[..., n : n + m], c, layout.horizon)
 
     def residual_spread(self, layout: TrajectoryLayout, trajectories: np.ndarray) -> np.ndarray:
         """V with V V' = R, the covariance of G tau - g that is left open, averaged over trajectories (N, d)."""
         x, u = layout.split(trajectories[:AT_MOST])
-        phi = np.concatenate([x[..., :-1, :], u], axis=-1)
-        n, p, T = layout.state_dim, phi.shape[-1], layout.horizon
+        n, p, T = layout.state_dim, self.mean.shape[-1] // layout.state_dim, layout.horizon
+        ones = np.ones((*u.shape[:-1], p - n - layout.input_dim))
+        phi = np.concatenate([x[..., :-1, :], u, ones], axis=-1)
         second = np.einsum("kta,ksb->tsab", phi, phi, optimize=True) / len(phi)
         open_ = self.covariance.reshape(*self.covariance.shape[:-2], p, n, p, n)
         R = np.einsum("tsab,...aibj->...tisj", second, open_, optimize=True)
         return semidefinite_root(R.reshape(*R.shape[:-4], T * n, T * n))
 
 
-def prior(layout: TrajectoryLayout, trajectories: np.ndarray) -> Belief:
+def prior(
+    layout: TrajectoryLayout, trajectories: np.ndarray, *, constant: bool = False, known: np.ndarray | None = None
+) -> Belief:
     """Which dynamics occur in demonstrations (N, d) of many robots.
+
+    Args:
+        constant: whether they have offsets that are to be found, each robot its own.
+        known: the offset (n,) that all of them have.
 
     Raises:
         ConfigError: if there are fewer than two.
@@ -111,9 +118,12 @@ def prior(layout: TrajectoryLayout, trajectories: np.ndarray) -> Belief:
     if len(trajectories) < 2:
         raise ConfigError("projector identified_family: a family is learned from the demonstrations of many robots")
     states, inputs = layout.split(trajectories[:: -(-len(trajectories) // AT_MOST)])
-    each = Transitions.of(states[:, None], inputs[:, None])
-    pooled, seen = least_squares(Transitions.of(states, inputs)), Moments.of(each)
-    mean = transposed(np.concatenate([pooled.A, pooled.B], axis=-1)).ravel()
+    c = np.zeros(layout.state_dim) if known is None else known
+    each, together = Transitions.of(states[:, None], inputs[:, None]).less(c), Transitions.of(states, inputs).less(c)
+    offset: Offset = "estimated" if constant else "none"
+    pooled, seen = least_squares(together, offset), Moments.of(each, constant=constant)
+    found = [pooled.A, pooled.B, *([pooled.c[..., None]] if constant else [])]
+    mean = transposed(np.concatenate(found, axis=-1)).ravel()
     belief = Belief(mean, np.eye(len(mean)), pooled.noise)
     for _ in range(ITERATIONS):
         belief = _maximised(belief.given(seen, belief.noise), seen)
@@ -138,6 +148,48 @@ def posterior(usual: Belief, seen: Moments) -> Belief:
 
 
 @dataclass(frozen=True)
+class Channels:
+    """States and inputs about a centre, each scaled to one size: what is found does not depend on units or origin.
+
+    Args:
+        centre_x, size_x: (n,).
+        centre_u, size_u: (m,).
+    """
+
+    centre_x: np.ndarray = field(repr=False)
+    size_x: np.ndarray = field(repr=False)
+    centre_u: np.ndarray = field(repr=False)
+    size_u: np.ndarray = field(repr=False)
+
+    @classmethod
+    def of(cls, layout: TrajectoryLayout, trajectories: np.ndarray, *, centred: bool) -> Channels:
+        """Those of trajectories (N, d): about their mean, or about 0."""
+        found: list[np.ndarray] = []
+        for values in layout.split(trajectories):
+            centre = values.mean(axis=(0, 1)) if centred else np.zeros(values.shape[-1])
+            size = np.sqrt(np.square(values - centre).mean(axis=(0, 1)))
+            found += [centre, np.where(size > 0, size, 1.0)]
+        return cls(*found)
+
+    def scaled(self, data: Transitions) -> Transitions:
+        """Transitions in these channels."""
+        x, following = ((values - self.centre_x) / self.size_x for values in (data.x, data.following))
+        return Transitions(x, (data.u - self.centre_u) / self.size_u, following)
+
+    def scaled_trajectories(self, layout: TrajectoryLayout, tau: np.ndarray) -> np.ndarray:
+        """Trajectories (N, d) in these channels."""
+        x, u = layout.split(tau)
+        return layout.flatten((x - self.centre_x) / self.size_x, (u - self.centre_u) / self.size_u)
+
+    def physical(self, stages: Stages, c: np.ndarray) -> Stages:
+        """Stages in physical units, with a further offset c (*robots, n)."""
+        A = self.size_x[:, None] * stages.A / self.size_x
+        B = self.size_x[:, None] * stages.B / self.size_u
+        moved = self.centre_x - A @ self.centre_x - B @ self.centre_u
+        return Stages(A, B, self.size_x * stages.c + moved + c[..., None, :])
+
+
+@dataclass(frozen=True)
 class IdentifiedFamily:
     """One robot's dynamics from a short recording, and from what demonstrations of its family say is usual.
 
@@ -148,11 +200,17 @@ class IdentifiedFamily:
     Args:
         initial_state: `fixed` holds x(0) = x_init.
         inflation: of the family's covariance, for robots that are less usual.
+        offset: each robot's c is `none`, `estimated` as A and B are, or `known` and the same for all robots.
     """
 
     initial_state: InitialState = "free"
     inflation: float = 1.0
-    needs: ClassVar[frozenset[str]] = frozenset({"recording", "demonstrations"})
+    offset: Offset = "none"
+
+    @property
+    def needs(self) -> frozenset[str]:
+        """A recording and demonstrations, and the system whose offset is known."""
+        return frozenset({"recording", "demonstrations"} | ({"system"} if self.offset == "known" else set()))
 
     def __post_init__(self) -> None:
         if not 0 < self.inflation < np.inf:
@@ -171,10 +229,28 @@ class IdentifiedFamily:
             raise ConfigError(
                 f"projector identified_family needs a {missing}, and none is given; choose one with {missing}=..."
             )
-        usual = prior(layout, demonstrations)
+        c, constant = self._known(layout, system), self.offset == "estimated"
+        channels = Channels.of(layout, demonstrations, centred=constant)
+        shown, size = channels.scaled_trajectories(layout, demonstrations), channels.size_x
+        seen = channels.scaled(Transitions.of(recording.states, recording.inputs)).less(c / size)
+        usual = prior(layout, shown, constant=constant, known=c / size)
         widened = Belief(usual.mean, self.inflation * usual.covariance, usual.noise)
-        belief = posterior(widened, Moments.of(Transitions.of(recording.states, recording.inputs)))
-        spread = belief.residual_spread(layout, demonstrations)
+        belief = posterior(widened, Moments.of(seen, constant=constant))
+        spread = np.tile(size, layout.horizon)[:, None] * belief.residual_spread(layout, shown)
         deviation = float(np.sqrt(np.square(spread).sum(axis=-1).mean()))
         notes = {"rank": layout.rank, "residual_deviation": deviation}
-        return Uncertain(layout, belief.stages(layout), spread, notes=notes)
+        return Uncertain(layout, channels.physical(belief.stages(layout), c), spread, notes=notes)
+
+    def _known(self, layout: TrajectoryLayout, system: System | None) -> np.ndarray:
+        """c (n,), 0 unless it is known."""
+        if self.offset != "known":
+            return np.zeros(layout.state_dim)
+        if system is None:
+            raise ConfigError("projector identified_family needs a system, whose offset is known; give one")
+        c = stages_of(system, 1).c.reshape(-1, layout.state_dim)
+        if np.ptp(c, axis=0).any():
+            raise ConfigError(
+                "projector identified_family: the robots' offsets differ, and those of the demonstrations are not "
+                "known; use projector.offset=estimated"
+            )
+        return np.asarray(c[0])

@@ -14,7 +14,7 @@ import numpy as np
 from dadiff.behaviours.stages import Stages, transposed
 from dadiff.errors import ExcitationError
 from dadiff.systems.features import Features, Regressed
-from dadiff.trajectory.subspace import numerical_rank
+from dadiff.trajectory.subspace import column_scaled, numerical_rank
 
 ROUNDING = 1e-13
 
@@ -38,6 +38,10 @@ class Transitions:
     def of(cls, states: np.ndarray, inputs: np.ndarray) -> Transitions:
         """All transitions of experiments: states (*robots, count, S+1, n), inputs (*robots, count, S, m)."""
         return cls(_joined(states[..., :-1, :]), _joined(inputs), _joined(states[..., 1:, :]))
+
+    def less(self, c: np.ndarray) -> Transitions:
+        """Those of the same dynamics without an offset c (*robots, n)."""
+        return Transitions(self.x, self.u, self.following - c[..., None, :])
 
     def __add__(self, other: Transitions) -> Transitions:
         """Both together."""
@@ -183,7 +187,7 @@ def lifted(data: Transitions, observables: Features, ridge: float = 0.0) -> tupl
 
 
 def _check_features(Phi: np.ndarray, ridge: float) -> None:
-    if not ridge and (rank := numerical_rank(Phi)) < Phi.shape[-1]:
+    if not ridge and (rank := numerical_rank(column_scaled(Phi))) < Phi.shape[-1]:
         raise ExcitationError(
             f"recording: its {Phi.shape[-2]} transitions span {rank} of the {Phi.shape[-1]} features; record longer, "
             "with inputs that vary more, choose fewer features or a ridge"
@@ -191,7 +195,7 @@ def _check_features(Phi: np.ndarray, ridge: float) -> None:
 
 
 def _check_rank(Phi: np.ndarray, needed: int) -> None:
-    if (rank := numerical_rank(Phi)) < Phi.shape[-1]:
+    if (rank := numerical_rank(column_scaled(Phi))) < Phi.shape[-1]:
         what, count = ("n + m", needed) if Phi.shape[-1] == needed else ("n + m + 1", needed + 1)
         raise ExcitationError(
             f"recording: states and inputs span {rank} dimensions, {what} = {count} are needed to identify the "

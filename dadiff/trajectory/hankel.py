@@ -18,32 +18,34 @@ def windows(signal: np.ndarray, depth: int) -> np.ndarray:
     return np.moveaxis(np.lib.stride_tricks.sliding_window_view(signal, depth, axis=-2), -1, -2)
 
 
-def minimum_length(layout: TrajectoryLayout, count: int = 1) -> int:
-    """The S from which `count` recordings give the n + mT columns that span the dynamics."""
-    return layout.horizon - 1 + -(-layout.rank // count)
+def minimum_length(layout: TrajectoryLayout, count: int = 1, spare: int = 0) -> int:
+    """The S from which `count` recordings give the n + mT columns that span the dynamics, and `spare` ones more."""
+    return layout.horizon - 1 + -(-(layout.rank + spare) // count)
 
 
-def identity_length(layout: TrajectoryLayout, count: int = 1) -> int:
-    """The S from which noisy columns fill R^d, so that H H† is the identity: d columns."""
-    return layout.horizon - 1 + -(-layout.size // count)
+def identity_length(layout: TrajectoryLayout, count: int = 1, spare: int = 0) -> int:
+    """The S from which noisy columns fill R^d, so that H H† is the identity: d columns, and those that are `spare`."""
+    return layout.horizon - 1 + -(-(layout.size + spare) // count)
 
 
-def trajectory_matrix(states: np.ndarray, inputs: np.ndarray, layout: TrajectoryLayout) -> np.ndarray:
+def trajectory_matrix(states: np.ndarray, inputs: np.ndarray, layout: TrajectoryLayout, spare: int = 0) -> np.ndarray:
     """H = [H_{T+1}(x); H_T(u)] of shape (*robots, d, count (S - T + 1)), eq. (10).
 
     Args:
         states: (*robots, count, S+1, n); the windows of several recordings stand side by side.
         inputs: (*robots, count, S, m).
+        spare: columns that are needed beside n + mT: one where an offset is estimated from them, too.
 
     Raises:
-        ExcitationError: if there are fewer than n + mT columns.
+        ExcitationError: if there are fewer than n + mT columns, and those that are spare.
     """
     count, length = inputs.shape[-3], inputs.shape[-2]
-    if count * (length - layout.horizon + 1) < layout.rank:
+    if count * (length - layout.horizon + 1) < layout.rank + spare:
         found = count * max(0, length - layout.horizon + 1)
+        needed = f"n + mT{f' + {spare}' if spare else ''} = {layout.rank + spare}"
         raise ExcitationError(
             f"recording: S = {length} is too short: {count} x {length} inputs give {found} windows of "
-            f"T = {layout.horizon}; n + mT = {layout.rank} are needed: record S >= {minimum_length(layout, count)}"
+            f"T = {layout.horizon}; {needed} are needed: record S >= {minimum_length(layout, count, spare)}"
         )
     columns = layout.flatten(windows(states, layout.horizon + 1), windows(inputs, layout.horizon))
     return columns.reshape(*columns.shape[:-3], -1, layout.size).swapaxes(-1, -2)

@@ -16,6 +16,12 @@ def numerical_rank(M: np.ndarray) -> int:
     return int((s > rank_tolerance(s, M.shape)).sum(axis=-1).min())
 
 
+def column_scaled(M: np.ndarray) -> np.ndarray:
+    """M (..., rows, columns) with columns of length 1, so that its rank does not depend on units; zeros stay zero."""
+    size = np.linalg.norm(M, axis=-2, keepdims=True)
+    return M / np.where(size > 0, size, 1.0)
+
+
 def column_basis(M: np.ndarray) -> np.ndarray:
     """Orthonormal basis (..., rows, columns) of the image of M, which has full column rank."""
     return np.linalg.qr(M)[0]
