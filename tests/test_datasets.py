@@ -8,12 +8,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from laws import composed, presets
 
 from dadiff.behaviours import Hankel, Known, compared
+from dadiff.config.build import build
 from dadiff.datasets import Generated, NpzRecordings, NpzTrajectories
 from dadiff.datasets.cached import load_data, save_data
 from dadiff.datasets.files import read_array
-from dadiff.errors import ConfigError, DataError
+from dadiff.errors import ConfigError, DataError, NotApplicableError
 from dadiff.systems import GaussianExcitation, Linear, double_integrator
 from dadiff.tasks import LQR, Demonstrations
 from dadiff.trajectory import Channel, Layout
@@ -54,6 +56,33 @@ def test_sizes_are_as_asked_and_the_same_seed_gives_the_same_data():
     assert np.array_equal(train.trajectories, two.train(TASK, SYSTEM).trajectories)
     assert np.array_equal(test.reference, two.test(TASK, SYSTEM).reference)
     assert not np.array_equal(test.reference, other.test(TASK, SYSTEM).reference)
+
+
+@pytest.mark.parametrize("name", presets("task"))
+def test_test_cases_from_stretched_ranges_start_and_end_farther_out(name):
+    config = composed(f"task={name}")
+    task, family = (build(config[group], group) for group in ("task", "system"))
+    system = task.target(family)
+    near, far = (Generated(2, 40, test_ranges=factor).test(task, system) for factor in (1.0, 3.0))
+    for field in ("x_init", "target"):
+        within = [np.abs(cases.get(field)).max() for cases in (near, far)]
+        assert 1.5 * within[0] < within[1] < 4 * within[0]
+
+
+def test_a_range_with_ends_is_stretched_about_its_middle():
+    task = LQR(init_range=[1.0, [2.0, 4.0], 0.0, 0.0]).stretched(2.0)
+    assert task.init_range == [2.0, [1.0, 5.0], 0.0, 0.0]
+    assert task.target_range == 8.0
+
+
+def test_stretching_the_test_cases_leaves_the_demonstrations():
+    assert len({str(Generated(9, test_ranges=factor).determined_by("train")) for factor in (1.0, 2.0)}) == 1
+    assert len({str(Generated(9, test_ranges=factor).determined_by("test")) for factor in (1.0, 2.0)}) == 2
+
+
+def test_a_task_without_ranges_says_that_it_cannot_be_stretched():
+    with pytest.raises(NotApplicableError, match="test_ranges is 2, but object has no"):
+        Generated(2, 2, test_ranges=2.0).test(object(), SYSTEM)
 
 
 def test_the_test_cases_do_not_move_with_the_training_size():

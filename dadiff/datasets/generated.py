@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol, get_args, runtime_checkable
 
@@ -9,7 +10,7 @@ from dadiff.errors import ConfigError, NotApplicableError
 from dadiff.randomness import numpy_generator
 from dadiff.systems import Family, System
 from dadiff.tasks import Cases, Demonstrations, Task
-from dadiff.tasks.task import Continuing
+from dadiff.tasks.task import Continuing, Stretching
 
 Part = Literal["train", "test"]
 StartStates = Literal["drawn", "along"]
@@ -42,22 +43,27 @@ class Generated:
         test_size: number of test cases (a robot).
         start_states: demonstrations begin at states that are `drawn`, or `along` trajectories of the expert, as a
             plan does that is made again on the way.
+        test_ranges: by what the ranges of starts and targets are stretched for test cases, so that they are unlike
+            the demonstrations; 1 draws both alike.
         seed: of the environments and the process noise.
     """
 
     train_size: int = 10_000
     test_size: int = 100
     start_states: StartStates = "drawn"
+    test_ranges: float = 1.0
     seed: int = 0
 
     def __post_init__(self) -> None:
         if self.train_size < 1 or self.test_size < 1:
             raise ConfigError(f"dataset: train_size is {self.train_size}, test_size {self.test_size}; need at least 1")
+        if not 0 < self.test_ranges < math.inf:
+            raise ConfigError(f"dataset: test_ranges is {self.test_ranges}; it must be finite and positive")
 
     def determined_by(self, part: Part) -> dict[str, Any]:
         """What the demonstrations or the cases depend on."""
         if part == "test":
-            return {"generated": self.test_size, "seed": self.seed}
+            return {"generated": self.test_size, "test_ranges": self.test_ranges, "seed": self.seed}
         return {"generated": self.train_size, "start_states": self.start_states, "seed": self.seed}
 
     def train(self, task: Task, system: System | Family) -> Demonstrations:
@@ -76,5 +82,18 @@ class Generated:
         return task.demonstrations_along(system, self.train_size, rng)
 
     def test(self, task: Task, system: System) -> Cases:
-        """`test_size` cases."""
+        """`test_size` cases.
+
+        Raises:
+            NotApplicableError: if their ranges are to be stretched, and the task has none.
+        """
+        if self.test_ranges != 1:
+            task = self._stretched(task)
         return task.cases(system, self.test_size, numpy_generator(self.seed, "cases"))
+
+    def _stretched(self, task: Task) -> Task:
+        if not isinstance(task, Stretching):
+            raise NotApplicableError(
+                f"dataset: test_ranges is {self.test_ranges:g}, but {type(task).__name__} has no `stretched`; use 1"
+            )
+        return task.stretched(self.test_ranges)

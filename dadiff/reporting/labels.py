@@ -40,6 +40,7 @@ SYMBOLS = {
     "recording.length": "S",
     "task.robots": "robots in training",
     "dataset.train_size": "demonstrations",
+    "dataset.test_ranges": "ranges of the cases",
     "training.steps": "gradient steps",
     "sampler.num_steps": "steps",
     "recording.process_noise": "σ_Γ",

@@ -18,7 +18,7 @@ from dadiff.errors import ConfigError
 from dadiff.systems import AffineSystem
 from dadiff.systems.families import LinearFamily, LinearRobots
 from dadiff.tasks.lqr import LQR, ends_layout
-from dadiff.tasks.quadratic import Range, Weight
+from dadiff.tasks.quadratic import Range, Weight, stretched
 from dadiff.tasks.robots import ManyRobots, joined, scores_of
 from dadiff.tasks.task import Cases, Demonstrations, Scores, encoded
 from dadiff.trajectory import Layout
@@ -50,6 +50,11 @@ class Fleet(ManyRobots):
         """The task of each robot."""
         costs = (self.state_cost, self.input_cost, self.terminal_cost)
         return LQR(self.horizon, *costs, self.init_range, self.target_range)
+
+    def stretched(self, factor: float) -> Fleet:
+        """The same task with the ranges of starts and targets times `factor`."""
+        ranges = {name: stretched(getattr(self, name), factor) for name in ("init_range", "target_range")}
+        return replace(self, **ranges)
 
     def target(self, system: LinearFamily) -> LinearRobots:
         """The test robots: those inside the ranges, then those outside.

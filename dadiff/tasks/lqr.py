@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -26,6 +26,7 @@ from dadiff.tasks.quadratic import (
     check_weight,
     is_zero,
     limits,
+    stretched,
     weight_matrix,
 )
 from dadiff.tasks.task import Cases, Demonstrations, Scores, encoded
@@ -80,6 +81,11 @@ class LQR:
             raise ConfigError("task: state_cost is 0 for every state, so every optimum costs nothing; raise one")
         if is_zero(self.init_range) and is_zero(self.target_range):
             raise ConfigError("task: init_range and target_range are both 0, so every optimum costs nothing; widen one")
+
+    def stretched(self, factor: float) -> LQR:
+        """The same task with the ranges of starts and targets times `factor`."""
+        ranges = {name: stretched(getattr(self, name), factor) for name in ("init_range", "target_range")}
+        return replace(self, **ranges)
 
     def cost(self, system: AffineSystem) -> QuadraticCost:
         """What a trajectory costs.

@@ -9,7 +9,7 @@ The expert is iterated LQR, each robot solved by its own.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -59,6 +59,11 @@ class Manoeuvre(ManyRobots):
         for name in ("terminal_weight", "input_cost"):
             if not 0 < (value := getattr(self, name)) < np.inf:
                 raise ConfigError(f"task: {name} is {value}; it must be finite and positive")
+
+    def stretched(self, factor: float) -> Manoeuvre:
+        """The same task with the ranges of starts and targets times `factor`."""
+        ranges = {name: [factor * value for value in getattr(self, name)] for name in ("init_range", "target_range")}
+        return replace(self, **ranges)
 
     def target(self, system: Family) -> Robots:
         """The test robots: those inside the ranges, then those outside.

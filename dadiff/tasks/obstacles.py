@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
@@ -97,6 +97,10 @@ class Obstacles:
             raise ConfigError(
                 f"task: radius_range is {list(self.radius_range)}; expected 0 < smallest <= largest (metres)"
             )
+
+    def stretched(self, factor: float) -> Obstacles:
+        """The same task with start, target and discs from ranges times `factor`."""
+        return replace(self, start_range=factor * self.start_range, box=factor * self.box)
 
     def target(self, system: System) -> System:
         """The system itself."""

@@ -93,6 +93,20 @@ def check_range(value: Range, name: str) -> None:
             )
 
 
+def stretched(value: Range, factor: float) -> Range:
+    """The range times `factor`; an item [low, high] about its middle."""
+    if not isinstance(value, Sequence):
+        return value * factor
+    return [_stretched_item(item, factor) for item in value]
+
+
+def _stretched_item(item: float | Sequence[float], factor: float) -> float | list[float]:
+    if not isinstance(item, Sequence):
+        return item * factor
+    middle, half = (item[0] + item[1]) / 2, (item[1] - item[0]) / 2
+    return [middle - factor * half, middle + factor * half]
+
+
 def is_zero(value: Range | Weight) -> bool:
     """Whether every number in it is 0."""
     items = value if isinstance(value, Sequence) else [value]

@@ -165,6 +165,15 @@ class Continuing(Protocol):
 
 
 @runtime_checkable
+class Stretching(Protocol):
+    """A task that can draw its environments from other ranges: test cases unlike the demonstrations."""
+
+    def stretched(self, factor: float) -> Task:
+        """The same task with every range of starts and targets times `factor`, about its middle."""
+        ...
+
+
+@runtime_checkable
 class Steering(Protocol):
     """A task that steers to a goal at quadratic cost, from whatever state: it can be planned for again and again."""
 
