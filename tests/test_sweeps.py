@@ -9,10 +9,13 @@ from pathlib import Path
 
 import pytest
 from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from hydra.types import RunMode
 
 from dadiff.config.composed import plain
 from dadiff.folders import shipped
 from dadiff.launching import register
+from dadiff.launching.composing import Composer
 from dadiff.launching.outcome import Outcome, why
 from dadiff.launching.plan import describe, make_plan
 from dadiff.launching.sweep import SweepRun, summary
@@ -74,6 +77,30 @@ def run_here(run: SweepRun) -> dict[str, Outcome]:
 def first(root):
     run = SweepRun.of(make_plan(configs(root)), "quick", "dadiff +sweeps=quick", {"projector": "known,none,hankel"})
     return run, run_here(run)
+
+
+VALUES = [
+    ["seed=0", "seed=3", "seed=true"],
+    ["++recording.seed=0", "++recording.seed=5"],
+    ["system.process_noise=0.1", "system.process_noise=0.2"],  # which the recording reads in an expression
+    ["output_dir=here", "output_dir=there"],  # which the store's address reads
+    ["evaluation.seed=1", "evaluation.seed=${dataset.seed}"],  # a value that reads another one
+    ["task.state_cost=[1,2,3,4]", "task.state_cost=1.0", "task.state_cost=null"],
+    ["training.steps=3", "training.steps=3.0"],
+]
+
+
+@pytest.mark.parametrize("projector", ["known", "hankel"])
+def test_cells_are_composed_as_hydra_composes_each_anew(projector):
+    with initialize_config_dir(str(shipped("conf").absolute()), version_base="1.3"):
+        loader = GlobalHydra.instance().config_loader()
+        composer = Composer(loader, loader.load_configuration("config", [], RunMode.MULTIRUN))
+        for k in range(3):
+            for moved in range(len(VALUES)):
+                chosen = [values[k % len(values) if row == moved else 0] for row, values in enumerate(VALUES)]
+                cell = [f"projector={projector}", *chosen]
+                config = compose("config", cell, return_hydra_config=True)
+                assert composer.cell(cell) == plain(config, config.hydra.runtime.choices), cell
 
 
 def test_a_plan_has_each_key_once_and_builds_what_is_shared_first(tmp_path):

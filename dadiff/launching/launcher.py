@@ -19,7 +19,6 @@ from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig
 
 from dadiff.commands import in_one_line
-from dadiff.config.composed import plain
 from dadiff.errors import DadiffError
 from dadiff.launching.composing import Composer
 from dadiff.launching.outcome import Outcome
@@ -48,9 +47,9 @@ class SweepLauncher(Launcher):
         """What runs the jobs of this start of a sweep, as long as the lease is held."""
 
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
-        """Called by Hydra's sweeper, which composes every cell with the same context before it launches."""
+        """Called by Hydra before its sweeper launches."""
         self.config = config
-        self.composer = hydra_context.config_loader = Composer(hydra_context.config_loader)  # type: ignore[assignment]
+        self.composer = Composer(hydra_context.config_loader, config)
 
     def launch(self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int) -> Sequence[JobReturn]:
         """Run the cells. Leaves with exit code 1 if any failed, 130 if interrupted."""
@@ -64,7 +63,7 @@ class SweepLauncher(Launcher):
         return [JobReturn(overrides=list(cell), status=JobStatus.COMPLETED) for cell in job_overrides]
 
     def _launch(self, job_overrides: Sequence[Sequence[str]]) -> int:
-        plan = make_plan([plain(*self.composer.cell(self.config, cell)) for cell in job_overrides])
+        plan = make_plan([self.composer.cell(cell) for cell in job_overrides])
         name = self._name()
         if plan.cells[0].config.get("dry_run"):
             sys.stdout.write(describe(plan) + "\n")
