@@ -23,19 +23,21 @@ from dadiff.interface import components_named, configuration, settle
 
 def one_run(config: dict[str, Any]) -> None:
     """Execute one resolved configuration, track it, and print its table."""
+    from dadiff.launching.jobs import run_tracked, stored_before
+    from dadiff.running import summary
+    from dadiff.running.identity import identify
+
+    if config.get("dry_run"):
+        identity = identify(config)
+        print(f"{identity.key}  {identity.name}")
+        return
+    if before := stored_before(config):
+        print(f"{summary.one_run(before)}\nstored before, nothing was run: {before.folder}")
+        return
     from dadiff.running.assembly import Experiment
 
-    experiment = Experiment.of(config)
-    if experiment.parts.settings.dry_run:
-        print(f"{experiment.identity.key}  {experiment.identity.name}")
-        return
-    from dadiff.launching.jobs import run_tracked
-    from dadiff.running import summary
-
-    before = experiment.is_done
-    stored = run_tracked(experiment)
-    print(summary.one_run(stored))
-    print(f"stored {'before, nothing was run: ' if before else 'in '}{stored.folder}")
+    stored = run_tracked(Experiment.of(config))
+    print(f"{summary.one_run(stored)}\nstored in {stored.folder}")
 
 
 @hydra.main(version_base="1.3", config_path=str(shipped("conf").absolute()), config_name="config")

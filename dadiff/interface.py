@@ -35,16 +35,17 @@ def run(overrides: Sequence[str] = (), config_dir: Path | str | None = None) -> 
     Raises:
         DadiffError: where the command line would print its line.
     """
-    from dadiff.running.assembly import Experiment
+    from dadiff.launching.jobs import run_tracked, stored_before
 
     settle()
-    experiment = Experiment.of(configuration(overrides, config_dir))
-    if experiment.parts.settings.dry_run:
+    config = configuration(overrides, config_dir)
+    if config.get("dry_run"):
         raise ConfigError("dry_run: a dry run has no result; use the command line")
+    if before := stored_before(config):
+        return before
+    from dadiff.running.assembly import Experiment
 
-    from dadiff.launching.jobs import run_tracked
-
-    return run_tracked(experiment)
+    return run_tracked(Experiment.of(config))
 
 
 def results(output_dir: Path | str = "outputs") -> pd.DataFrame:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -157,6 +158,8 @@ def test_a_sweep_whose_cells_are_done_has_nothing_to_do(first, root):
     run = SweepRun.of(make_plan(configs(root, CELLS[:3])), "over", "dadiff", {})
     assert run_here(run) == {}
     assert [cell.status for cell in Sweeps(root).read("over").cells] == ["finished"] * 2
+    assert run.is_told()  # so that the same command answers without MLflow
+    assert not replace(run, command="dadiff another").is_told()
     forced = make_plan(configs(root, [[*CELLS[0], "force=true"]]))
     assert len(forced.waiting) == 1
 

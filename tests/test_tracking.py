@@ -84,6 +84,25 @@ def test_nothing_is_logged_twice(tracking, tmp_path):
     assert len(open_client(tracking.uri).get_metric_history(mirror.info.run_id, "t/gap")) == 2
 
 
+def test_what_a_database_holds_is_seen_without_mlflow(tracking, tmp_path):
+    run, cell = store(tmp_path), Cell(KEY, "lqr/known/seed=1", status="finished")
+    Sweeps(tmp_path).write(Sweep("one", "dadiff", {}, [cell]))
+    assert not tracking.mirrors(tmp_path, [run])
+    tracking.log_run(run)
+    assert tracking.mirrors(tmp_path, [run])
+    assert not tracking.mirrors(tmp_path, [run], "one")  # its sweep is not mirrored
+    parent = tracking.log_sweep(tmp_path, "one")
+    assert not tracking.mirrors(tmp_path, [run], "one")  # nor is it nested under that
+    tracking.log_run(run, parent)
+    assert tracking.mirrors(tmp_path, [run], "one")
+    again = store(tmp_path, name="another")
+    assert not tracking.mirrors(tmp_path, [again], "one")  # what lies on disk has changed
+    tracking.log_run(again, parent)
+    assert tracking.mirrors(tmp_path, [again], "one")
+    open_client(tracking.uri).delete_run(parent)
+    assert not tracking.mirrors(tmp_path, [again], "one")
+
+
 def test_a_failed_run_is_mirrored_as_such_until_it_is_done(tracking, tmp_path):
     Results(tmp_path).write_failure(Record(KEY, "x", "killed", "SIGKILL"))
     tracking.log_run(Results(tmp_path).read(KEY))

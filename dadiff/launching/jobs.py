@@ -7,7 +7,8 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from dadiff.launching.outcome import why
-from dadiff.running.identity import Identity, Shared
+from dadiff.running.identity import Identity, Shared, identity_of
+from dadiff.running.parts import Parts
 from dadiff.running.provenance import record_of
 from dadiff.store import Results, Status, StoredRun, is_read_only
 
@@ -23,16 +24,28 @@ def run(config: Mapping[str, Any]) -> StoredRun:
     return execute(Experiment.of(config, anew=()))
 
 
-def run_tracked(experiment: Experiment) -> StoredRun:
-    """Run what is assembled, and mirror whatever became of it, and its training, into MLflow.
+def stored_before(config: Mapping[str, Any]) -> StoredRun | None:
+    """The result of a configuration that is done and mirrored, or lies where nothing can be written; None of others.
 
-    What is done, in a folder that cannot be written to, is read.
+    Loads neither torch nor MLflow, so that a repeated command answers at once.
+
+    Raises:
+        ConfigError: if the configuration is not valid.
     """
+    parts = Parts.of(config)
+    key, output_dir = identity_of(parts).key, parts.settings.output_dir
+    results = Results(output_dir)
+    if parts.settings.force or not results.is_done(key):
+        return None
+    run = results.read(key)
+    return run if is_read_only(output_dir) or parts.tracking.mirrors(output_dir, [run]) else None
+
+
+def run_tracked(experiment: Experiment) -> StoredRun:
+    """Run what is assembled, and mirror whatever became of it, and its training, into MLflow."""
     from dadiff.running.experiment import execute
 
     tracking, identity = experiment.parts.tracking, experiment.identity
-    if experiment.is_done and is_read_only(experiment.output_dir):
-        return experiment.results.read(identity.key)
     tracking.prepare()
     try:
         return execute(experiment)

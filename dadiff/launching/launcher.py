@@ -28,7 +28,7 @@ from dadiff.launching.sweep import SweepRun, summary
 from dadiff.launching.table import Table
 from dadiff.launching.work import Running, Work
 from dadiff.running.summary import several_runs
-from dadiff.store import DONE, Lease, Sweeps, is_read_only
+from dadiff.store import DONE, Lease, Sweep, Sweeps, is_read_only
 from dadiff.store.names import sweep_name
 
 
@@ -72,6 +72,10 @@ class SweepLauncher(Launcher):
         if not plan.waiting and is_read_only(run.output_dir):
             sys.stderr.write(f"{summary(run.record(run.cells()), len(plan.cells), run.folder)}\n")
             return 0
+        if run.is_told():
+            sys.stderr.write(_said_of_done(len(plan.cells), len(plan.cells)))
+            _tell(run, run.record(run.cells()), len(plan.cells))
+            return 0
         with Sweeps(run.output_dir).running(run.name) as lease:
             return self._run(run, lease)
 
@@ -99,9 +103,14 @@ class SweepLauncher(Launcher):
             interrupted = True
         watch.close()
         sweep = run.close(watch.outcomes, interrupted=interrupted)
-        sys.stdout.write(f"{several_runs(run.stored(sweep))}\n")
-        sys.stderr.write(f"{summary(sweep, skipped, run.folder)}\n{run.tracking.how_to_look(run.name)}\n")
+        _tell(run, sweep, skipped)
         return 130 if interrupted else int(any(cell.status not in DONE for cell in sweep.cells))
+
+
+def _tell(run: SweepRun, sweep: Sweep, skipped: int) -> None:
+    """Its runs as a table, how it ended, and where to look."""
+    sys.stdout.write(f"{several_runs(run.stored(sweep))}\n")
+    sys.stderr.write(f"{summary(sweep, skipped, run.folder)}\n{run.tracking.how_to_look(run.name)}\n")
 
 
 def _said_of_done(done: int, total: int) -> str:

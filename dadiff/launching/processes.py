@@ -7,14 +7,8 @@ from dadiff.launching.process_pool import ProcessPool
 from dadiff.launching.sweep import SweepRun
 from dadiff.store import Lease
 
-PRELOAD = (
-    "dadiff.cli",
-    "dadiff.running.experiment",
-    "mlflow.store.tracking.sqlalchemy_store",
-    "mlflow.tracking.client",
-    "control",
-    "pyarrow.parquet",
-)
+PRELOAD = ("dadiff.cli", "dadiff.running.experiment", "pyarrow.parquet")
+"""What most jobs use; not MLflow, which the launcher alone talks to."""
 
 
 class ProcessesLauncher(SweepLauncher):

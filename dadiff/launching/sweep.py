@@ -62,6 +62,17 @@ class SweepRun:
         Sweeps(self.output_dir).write(self.record(self.cells()))
         return self.tracking.log_sweep(self.output_dir, self.name)
 
+    def is_told(self) -> bool:
+        """Whether all is done, recorded and mirrored as this start of the sweep would do it, so that nothing is left.
+
+        Raises:
+            DataError: if the sweep's record is damaged.
+        """
+        record = self.record(self.cells())
+        if self.plan.waiting or not Sweeps(self.output_dir).holds(record):
+            return False
+        return self.tracking.mirrors(self.output_dir, self.stored(record), self.name)
+
     def works(self) -> list[Work]:
         """What is to be done: data sets and trainings first, cells after what they need."""
         return [*map(self._preparation, self.plan.preparations), *map(self._run, self.plan.waiting)]

@@ -16,7 +16,7 @@ from typing import Any
 
 from dadiff.errors import DataError, LockedError
 from dadiff.outside import passwords_removed
-from dadiff.store.files import is_locked, locked, make_folder, write_json
+from dadiff.store.files import is_locked, locked, make_folder, read_json, strict, write_json
 from dadiff.store.names import SWEEP, key_of, sweep_name
 from dadiff.store.typed import read_typed
 
@@ -130,6 +130,14 @@ class Sweeps:
         folder = make_folder(self.folder(sweep.name))
         write_json(folder / "sweep.json", passwords_removed(asdict(sweep)))
         return folder
+
+    def holds(self, sweep: Sweep) -> bool:
+        """Whether exactly this is stored, with its table."""
+        folder = self.folder(sweep.name)
+        if not ((folder / "sweep.json").is_file() and (folder / "results.csv").is_file()):
+            return False
+        stored = read_json(folder / "sweep.json")
+        return strict(passwords_removed(asdict(sweep))) == {k: v for k, v in stored.items() if k != "format"}
 
     def read(self, name: str) -> Sweep:
         """One stored sweep.

@@ -33,7 +33,7 @@ def prepare_database(path: Path, experiment: str, artifacts: str | None) -> None
         StoreError: if the file is something else than a database of MLflow's, which is left alone.
     """
     make_folder(path.parent)
-    if path.exists() and (damage := _damage(path, experiment, artifacts)):
+    if path.exists() and (damage := damage_of(path, experiment, artifacts)):
         aside = _set_aside(path)
         log.warning("%s %s: set aside as %s, and filled again from what lies on disk", path, damage, aside.name)
     if not path.exists():
@@ -41,7 +41,7 @@ def prepare_database(path: Path, experiment: str, artifacts: str | None) -> None
     _write_ahead(path)
 
 
-def _damage(path: Path, experiment: str, artifacts: str | None) -> str | None:
+def damage_of(path: Path, experiment: str, artifacts: str | None) -> str | None:
     """What keeps a database of MLflow's from being used."""
     if path.stat().st_size == 0:
         return "is empty"

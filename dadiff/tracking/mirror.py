@@ -18,12 +18,12 @@ from typing import TYPE_CHECKING
 from dadiff.store import store_id
 from dadiff.store.files import locked
 from dadiff.tracking.content import Content, Piece, chunks
+from dadiff.tracking.links import PARENT
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
     from mlflow.entities import Run
 
-PARENT = "mlflow.parentRunId"
 METRICS_AT_ONCE, PARAMS_AT_ONCE = 1000, 100  # that MLflow takes
 
 

@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 from dadiff.errors import ConfigError
 from dadiff.outside import without_passwords
-from dadiff.store import StoredRun, Sweep, Sweeps
+from dadiff.store import StoredRun, Sweep, Sweeps, store_id
 from dadiff.tracking.client import open_client, prepare_store, spared
 from dadiff.tracking.content import Piece, run_piece, sweep_piece, sweep_view, training_piece
-from dadiff.tracking.database import SQLITE
+from dadiff.tracking.database import SQLITE, damage_of
+from dadiff.tracking.links import Held, held
 from dadiff.tracking.mirror import opened
 
 if TYPE_CHECKING:
@@ -103,7 +104,6 @@ class Tracking:
         if not self.enabled:
             return 0
         brought, parents = 0, dict[str, str]()
-        trainings = list(dict.fromkeys(run.record.links["denoiser"] for run in runs if "denoiser" in run.record.links))
         with opened(self._client, self._experiment_id, output_dir) as mirror:
             for name in sweeps:
                 run_id, missed = mirror.bring(sweep_piece(output_dir, name))
@@ -111,18 +111,48 @@ class Tracking:
                 self._show(sweep, run_id)
                 parents = {cell.key: run_id for cell in sweep.cells} | parents
                 brought += missed
-            for piece in filter(None, (training_piece(output_dir, key) for key in trainings)):
+            for piece in filter(None, (training_piece(output_dir, key) for key in _trainings(runs))):
                 brought += mirror.bring(piece)[1]
             for run in runs:
                 brought += mirror.bring(run_piece(run), parents.get(run.key))[1]
             mirror.tidy()
         return brought
 
+    def mirrors(self, output_dir: Path | str, runs: Sequence[StoredRun], sweep: str | None = None) -> bool:
+        """Whether the store has all of it as it lies on disk; no more than a guess, False, of one that is no file.
+
+        Args:
+            sweep: that the runs are nested under.
+        """
+        if not self.enabled:
+            return True
+        found, store = self._held(), store_id(output_dir)
+        if found is None:
+            return False
+        parent = None
+        if sweep is not None:
+            parent = found.whole(store, sweep_piece(output_dir, sweep))
+            if parent is None or _view(sweep) not in found.views:
+                return False
+        trainings = filter(None, (training_piece(output_dir, key) for key in _trainings(runs)))
+        return all(found.whole(store, piece) for piece in trainings) and all(
+            found.whole(store, run_piece(run), parent) for run in runs
+        )
+
+    def _held(self) -> Held | None:
+        """What the store holds, if it is a file, and whole."""
+        path = Path(self.uri.removeprefix(SQLITE))
+        if not self.uri.startswith(SQLITE) or not path.is_file() or damage_of(path, self.experiment, self.artifacts):
+            return None
+        return held(path, self.experiment)
+
     def how_to_look(self, sweep_name: str) -> str:
         """What a person types and opens to see a sweep in MLflow's pages, with its axes and metrics as columns."""
         if not self.enabled:
             return "tracking is off"
-        page = f"/#/experiments/{self._experiment_id}/runs?viewStateShareKey={sweep_name}"
+        found = self._held()
+        experiment_id = self._experiment_id if found is None else found.experiment_id
+        page = f"/#/experiments/{experiment_id}/runs?viewStateShareKey={sweep_name}"
         if self.uri.startswith("http"):
             return f"open {without_passwords(self.uri)}{page}"
         return f"mlflow ui --backend-store-uri {self.uri}   then open http://127.0.0.1:5000{page}"
@@ -144,4 +174,14 @@ class Tracking:
 
     def _show(self, sweep: Sweep, run_id: str) -> None:
         view = sweep_view(sweep, run_id)
-        self._client.set_experiment_tag(self._experiment_id, f"mlflow.sharedViewState.{sweep.name}", view)
+        self._client.set_experiment_tag(self._experiment_id, _view(sweep.name), view)
+
+
+def _trainings(runs: Iterable[StoredRun]) -> list[str]:
+    """Keys of what runs were made with."""
+    return list(dict.fromkeys(run.record.links["denoiser"] for run in runs if "denoiser" in run.record.links))
+
+
+def _view(sweep_name: str) -> str:
+    """The experiment's tag that holds the state of the page that shows a sweep."""
+    return f"mlflow.sharedViewState.{sweep_name}"
