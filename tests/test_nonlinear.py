@@ -81,6 +81,8 @@ def test_hover_is_an_equilibrium_of_every_robot():
 def test_what_cannot_be_is_refused():
     with pytest.raises(ShapeError, match=r"maps states \(3, 2\) and inputs \(3, 1\) to \(3,\); expected \(3, 2\)"):
         Simulated(lambda x, u: x[..., 0], 2, 1)
+    with pytest.raises(ConfigError, match=r"torch cannot differentiate the function \(.*use Simulated"):
+        Nonlinear(lambda x, u: np.stack([x[..., 1], u[..., 0] - np.sin(x[..., 0])], axis=-1), 2, 1)
     with pytest.raises(ConfigError, match="integrator rk4 needs a time_step"):
         Nonlinear(lambda x, u: x, 2, 1, integrator="rk4")
     with pytest.raises(ConfigError, match="continuous dynamics need a time_step"):

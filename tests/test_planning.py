@@ -169,6 +169,22 @@ def without_arrays(path: Path) -> None:
         file.writestr("arrays.safetensors", arrays_to_bytes({}))
 
 
+def described_as(path: Path, description: object) -> None:
+    """A file whose description is another."""
+    with zipfile.ZipFile(path, "w") as file:
+        file.writestr("planner.json", description if isinstance(description, str) else json.dumps(description))
+        file.writestr("arrays.safetensors", arrays_to_bytes({}))
+
+
+def nested(depth: int) -> str:
+    return "[" * depth + "]" * depth
+
+
+def _shorter_condition(description: dict) -> None:
+    channels = description["planner"]["denoiser"]["fields"]["condition"]["fields"]["channels"]
+    next(iter(channels.values())).pop()
+
+
 def changed(change):
     return lambda path: rewritten(planner(network=True).save(path), change)
 
@@ -191,6 +207,16 @@ FILES = {
     "which is no dataclass": changed(lambda d: d["planner"]["task"].update({"class": "dadiff.tasks.lqr:np"})),
     "does not fit this version": changed(lambda d: d["planner"]["task"]["fields"].update(speed=1)),
     "horizon is -1": changed(lambda d: d["planner"]["task"]["fields"].update(horizon=-1)),
+    "its coordinates has tau of 184 entries, its task and system 190": changed(
+        lambda d: d["planner"]["task"]["fields"].update(horizon=31)
+    ),
+    "its denoiser has tau of 6000000004 entries": changed(
+        lambda d: d["planner"]["denoiser"]["fields"]["layout"]["fields"].update(horizon=10**9)
+    ),
+    "its denoiser takes E of 4 entries, its task 8": changed(_shorter_condition),
+    "lacks a part of a planner .*LQR": changed(lambda d: d["planner"].update(system=d["planner"]["task"])),
+    "robot.zip: is no planner of dadiff; write": lambda path: described_as(path, [1, 2]),
+    "damaged .maximum recursion": lambda path: described_as(path, nested(100_000)),
     "tensor network": changed(lambda d: d["planner"]["denoiser"]["fields"]["recipe"]["fields"].update(width=8)),
 }
 
@@ -203,6 +229,23 @@ def test_what_is_no_planner_is_one_line_and_executes_nothing(tmp_path, message, 
         Planner.load(path)
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "executed").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"samples": 0}, "samples is 0; ask for at least 1"),
+        ({"environment": np.zeros(8)}, "both E and its fields x_init, target are given"),
+        (
+            {"samples": 2, "start": Plans(LAYOUT, np.zeros((3, LAYOUT.size)), 0)},
+            r"start has shape \(3, 184\), expected",
+        ),
+        ({"seed": -1}, "seed of sampling noise: is -1"),
+    ],
+)
+def test_what_cannot_be_planned_is_refused(arguments, message):
+    with pytest.raises(DadiffError, match=message):
+        planner().plan(**{"x_init": [0, 0, 0, 0], "target": [1, 2, 0, 0], **arguments})
 
 
 def test_a_planner_with_a_function_says_that_it_cannot_be_stored():

@@ -233,6 +233,8 @@ def test_a_state_space_system_is_discretised():
 def test_a_state_space_system_of_another_step_is_refused(dt, time_step, message):
     with pytest.raises(ConfigError, match=message):
         from_control(control.ss(np.eye(2), np.ones((2, 1)), np.eye(2), 0, dt), time_step)
+    with pytest.raises(ConfigError, match=r"takes a StateSpace, found a TransferFunction; convert it by control\.ss"):
+        from_control(control.tf([1], [1, 1]), 0.1)
 
 
 @pytest.mark.parametrize(

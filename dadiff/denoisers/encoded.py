@@ -32,6 +32,11 @@ class EncodedParts:
     coordinates: Coordinates
     schedule: Schedule
 
+    @property
+    def sizes(self) -> tuple[int, None]:
+        """d; the network is told features of E."""
+        return self.network.layout.size, None
+
     def build(self, device: str = "cpu") -> EncodedDenoiser:
         """The denoiser, its weights yet to be filled in."""
         return EncodedDenoiser(self.network.build(device), self.encoder, self.coordinates, self.schedule)

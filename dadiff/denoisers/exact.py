@@ -100,6 +100,11 @@ class ExactParts:
     coordinates: Coordinates
     schedule: Schedule
 
+    @property
+    def sizes(self) -> tuple[int, int]:
+        """d, and entries of E."""
+        return self.law.mean_map.shape[-2], self.law.mean_map.shape[-1]
+
     def build(self, device: str) -> ExactDenoiser:
         """The denoiser."""
         return ExactDenoiser(self.law, self.coordinates, self.schedule, device)

@@ -113,6 +113,11 @@ class NetworkParts:
     condition: Layout
     schedule: Schedule
 
+    @property
+    def sizes(self) -> tuple[int, int]:
+        """d, and entries of E."""
+        return self.layout.size, self.condition.size
+
     def build(self, device: str) -> NetworkDenoiser:
         """The denoiser, before its weights are filled in."""
         generator = torch.Generator()

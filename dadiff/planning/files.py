@@ -25,7 +25,7 @@ from dadiff import __version__
 from dadiff.denoisers.checkpoints import fill
 from dadiff.errors import CheckpointError
 from dadiff.planning.codec import Decoder, Encoder
-from dadiff.planning.planner import Planner
+from dadiff.planning.planner import Parts, Planner
 from dadiff.store import Cache
 
 FORMAT = 1
@@ -93,11 +93,13 @@ def planner_of(
     """The planner that is described, with the weights among the arrays."""
     _check_format(description, where)
     decode = Decoder(arrays, where, components)
-    parts = {name: decode(plain) for name, plain in description["planner"].items()}
     try:
-        denoiser = parts.pop("denoiser").build(device)
+        parts = {name: decode(plain) for name, plain in description["planner"].items()}
+        made = parts.pop("denoiser")
+        _check_sizes(made, parts, where)
+        denoiser = made.build(device)
         planner = Planner(denoiser=denoiser, device=device, **parts)
-    except (KeyError, TypeError, AttributeError) as error:
+    except (KeyError, TypeError, AttributeError, RecursionError) as error:
         raise CheckpointError(f"{where}: lacks a part of a planner ({error}); save it again") from error
     weights = {
         name.removeprefix(WEIGHTS): torch.from_numpy(a) for name, a in arrays.items() if name.startswith(WEIGHTS)
@@ -106,8 +108,23 @@ def planner_of(
     return planner
 
 
+def _check_sizes(made: Parts, parts: Mapping[str, Any], where: str) -> None:
+    """Raise unless all parts are of the same trajectories and condition: before anything of their sizes is built."""
+    system, task, behaviour = parts["system"], parts["task"], parts.get("behaviour")
+    d, c = system.layout(task.horizon).size, task.condition(system).size
+    found = {"coordinates": parts["coordinates"].mean.size, "denoiser": made.sizes[0]}
+    found |= {"set": behaviour.layout.size} if behaviour else {}
+    for part, size in found.items():
+        if size != d:
+            raise CheckpointError(
+                f"{where}: its {part} has tau of {size} entries, its task and system {d}; save it again"
+            )
+    if made.sizes[1] not in (None, c):
+        raise CheckpointError(f"{where}: its denoiser takes E of {made.sizes[1]} entries, its task {c}; save it again")
+
+
 def _check_format(description: Mapping[str, Any], where: str) -> None:
-    found = description.get("format")
+    found = description.get("format") if isinstance(description, Mapping) else None
     if not isinstance(found, int) or not isinstance(description.get("planner"), dict):
         raise CheckpointError(f"{where}: is no planner of dadiff; write one with planner.save(...)")
     if found > FORMAT:
@@ -153,7 +170,8 @@ def _opened(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         with zipfile.ZipFile(path) as file:
             _check_entries(file, path)
             return json.loads(file.read(DESCRIPTION)), read_arrays(file.read(ARRAYS))
-    except (zipfile.BadZipFile, json.JSONDecodeError, UnicodeDecodeError, SafetensorError, KeyError, OSError) as error:
+    except (zipfile.BadZipFile, json.JSONDecodeError, UnicodeDecodeError, SafetensorError, KeyError, OSError,
+            RecursionError) as error:  # fmt: skip
         raise CheckpointError(f"{path}: is no planner of dadiff, or damaged ({error})") from error
 
 

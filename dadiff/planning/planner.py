@@ -8,7 +8,7 @@ It knows no store, no stop-watch and no configuration.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -24,7 +24,7 @@ from dadiff.diffusion.enforcement import Enforcement
 from dadiff.diffusion.estimate import Estimate
 from dadiff.diffusion.samplers import Sampler
 from dadiff.diffusion.schedule import Schedule
-from dadiff.errors import NotApplicableError, ShapeError
+from dadiff.errors import DataError, NotApplicableError, ShapeError
 from dadiff.planning.plans import Plans
 from dadiff.randomness import torch_generator
 from dadiff.systems.system import System
@@ -34,16 +34,26 @@ from dadiff.trajectory.layout import Layout, TrajectoryLayout
 
 if TYPE_CHECKING:
     from dadiff.behaviours import Projector
-    from dadiff.denoisers.encoded import EncodedParts
-    from dadiff.denoisers.exact import ExactParts
-    from dadiff.denoisers.learned import NetworkParts
+
+
+class Parts(Protocol):
+    """What a denoiser is made from, besides weights."""
+
+    @property
+    def sizes(self) -> tuple[int, int | None]:
+        """Entries of tau, and of E where it is told that and not something made of it."""
+        ...
+
+    def build(self, device: str) -> Denoiser:
+        """The denoiser, its weights yet to be filled in."""
+        ...
 
 
 class Denoiser(Protocol):
     """A denoiser that can be stored: trained, or exact."""
 
     @property
-    def made_from(self) -> NetworkParts | EncodedParts | ExactParts:
+    def made_from(self) -> Parts:
         """All but its weights."""
         ...
 
@@ -112,13 +122,12 @@ class Planner:
             pins: further entries of tau that are held, with values (*robots, *cases * samples, k).
 
         Raises:
-            DataError: if a field of E is missing, not known, or unusable.
-            ShapeError: if E has another shape.
+            DataError: if a field of E is missing, not known, or unusable, or no plan is asked for.
+            ShapeError: if E, or the plans to begin from, have another shape.
         """
-        E = self.task.environment(self.system, fields) if environment is None else np.asarray(environment, np.float64)
-        lead, E = self._flat(E, samples)
+        lead, E = self._flat(self._condition(environment, fields), samples)
         generator = torch_generator(seed, "sampling noise")
-        begin = None if start is None else start.tau.reshape(*E.shape[:-1], self.layout.size)
+        begin = None if start is None else self._begun(start, (*lead, samples)).reshape(*E.shape[:-1], -1)
         project = self.projection(E, pins)
         drawn = self.draw(E, generator, project, start=begin)
         tau = self.coordinates.to_physical(drawn.tau.cpu().numpy())
@@ -131,9 +140,28 @@ class Planner:
             self.system.time_step,
         )
 
+    def _condition(self, environment: np.ndarray | None, fields: Mapping[str, object]) -> np.ndarray:
+        """E, as it is or from its fields."""
+        if environment is None:
+            return self.task.environment(self.system, fields)
+        if fields:
+            raise DataError(f"plan: both E and its fields {', '.join(fields)} are given; give one of them")
+        return np.asarray(environment, np.float64)
+
+    def _begun(self, start: Plans, expected: tuple[int, ...]) -> np.ndarray:
+        """tau of plans to begin from (*robots, *cases, samples, d)."""
+        if start.tau.shape != (*expected, self.layout.size):
+            raise ShapeError(
+                f"plan: start has shape {start.tau.shape}, expected {(*expected, self.layout.size)}: one for each "
+                "plan that is asked for"
+            )
+        return start.tau
+
     def _flat(self, E: np.ndarray, samples: int) -> tuple[tuple[int, ...], np.ndarray]:
         """The leading dimensions of E, and E once for each plan, (*robots, plans, c)."""
         robots = self.system.robots
+        if samples < 1:
+            raise DataError(f"plan: samples is {samples}; ask for at least 1")
         if E.shape[-1:] != (self.condition.size,):
             raise ShapeError(
                 f"plan: the condition has shape {E.shape}; its last dimension must be {self.condition.size}: "

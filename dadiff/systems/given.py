@@ -69,8 +69,14 @@ def from_control(
         process_noise, bounds: see `inline`.
 
     Raises:
-        ConfigError: if a continuous system comes without a time step, or a discrete one has another.
+        ConfigError: if it is no StateSpace, a continuous one comes without a time step, or a discrete one has another.
     """
+    import control
+
+    if not isinstance(ss, control.StateSpace):
+        raise ConfigError(
+            f"system: from_control takes a StateSpace, found a {type(ss).__name__}; convert it by control.ss"
+        )
     step, (A, B) = _step_of(ss, time_step), (ss.A, ss.B)
     if ss.dt == 0:
         A, B = discretise(A, B, step, method)

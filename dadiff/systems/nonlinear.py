@@ -147,6 +147,19 @@ class Nonlinear(_Given):
         if self.integrator != "none" and self.time_step is None:
             raise ConfigError(f"system: integrator {self.integrator} needs a time_step (seconds), found none")
         self._check_function()
+        if self.jacobian is None:
+            self._check_derivative()
+
+    def _check_derivative(self) -> None:
+        """Raise unless torch can differentiate the function, which it cannot where that leaves torch for numpy."""
+        try:
+            self.linearise(np.zeros((*self.robots, 3, self.states)), np.zeros((*self.robots, 3, self.inputs)))
+        except (RuntimeError, TypeError, AttributeError) as error:
+            reason = str(error).splitlines()[0]
+            raise ConfigError(
+                f"system: torch cannot differentiate the function ({reason}); write it in torch, give jacobian=..., or "
+                "use Simulated, which takes differences"
+            ) from error
 
     def step(self, x: np.ndarray, u: np.ndarray, t: Times = 0) -> np.ndarray:
         """f(x, u), integrated over a time step where f is a rate."""
@@ -154,7 +167,7 @@ class Nonlinear(_Given):
             return self._move(x, u)
         import torch
 
-        return self._move(torch.as_tensor(x), torch.as_tensor(u)).numpy()
+        return np.asarray(self._move(torch.as_tensor(x), torch.as_tensor(u)))
 
     def linearise(self, x: np.ndarray, u: np.ndarray, t: Times = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """See `System.linearise`."""
