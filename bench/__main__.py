@@ -1,6 +1,6 @@
 """All measurements, each beside a peer or a floor from the same run: `make bench`. Leave the machine alone meanwhile.
 
-    python -m bench [part ...]      # learning planning optima projecting overhead nonlinear projections
+    python -m bench [part ...]      # learning planning optima one_plan projecting overhead nonlinear projections
 
 Prints a table, and writes `outputs/bench.json` and `outputs/bench.svg`.
 """
@@ -24,6 +24,7 @@ PARTS = {  # part: threads; None leaves them to torch
     "learning": None,
     "planning": None,
     "optima": 1,
+    "one_plan": 1,
     "projecting": 1,
     "overhead": None,
 }

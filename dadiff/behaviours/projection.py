@@ -102,6 +102,7 @@ class Geometry:
         self._plain, self._weighted = plain, weighted
         self._identity: Form | None = None
         self._forms: WeakKeyDictionary[Covariance, Form] = WeakKeyDictionary()
+        self._converted: dict[object, tuple[Form, Form]] = {}
 
     def form(self, metric: Covariance | None = None) -> Form:
         """The form in a metric; None stands for the identity."""
@@ -112,6 +113,17 @@ class Geometry:
         if metric not in self._forms:
             self._forms[metric] = self._weighted(metric)
         return self._forms[metric]
+
+    def converted(self, form: Form, tau: Array) -> Form:
+        """A form of this set as arrays of tau's kind, converted once for each kind and not for each binding."""
+        if isinstance(tau, np.ndarray):
+            return form
+        kind = (id(form), tau.dtype, tau.device)
+        if kind not in self._converted:
+            if len(self._converted) == KEPT:
+                del self._converted[next(iter(self._converted))]
+            self._converted[kind] = (like(form, tau), form)  # beside its copy, so that its id is not another's
+        return self._converted[kind][0]
 
 
 def check_shape(tau: Array, shape: tuple[int, ...]) -> None:
@@ -135,7 +147,7 @@ class Projection:
 
     def __init__(self, geometry: Geometry, shape: tuple[int, ...], pinned: Pinned) -> None:
         self._geometry, self._shape, self._pinned = geometry, shape, pinned
-        self._converted: dict[object, tuple[Form, Array, Form]] = {}
+        self._given: dict[object, tuple[Array, Form]] = {}
         self.info = ProjectionInfo(geometry.rank, geometry.kind)
 
     def __call__(
@@ -196,12 +208,9 @@ class Projection:
 
     def _bound(self, form: Form, tau: Array) -> tuple[Form, Array]:
         """The form with what follows from the pins, as arrays of tau's kind; converted once for each kind."""
-        kind = (id(form), type(tau), tau.dtype, getattr(tau, "device", None))
-        if kind not in self._converted:
-            if len(self._converted) == KEPT:
-                del self._converted[next(iter(self._converted))]
-            given = form.given(self._pinned.values)
-            # The form stands beside its copy, so that its id is not another's.
-            self._converted[kind] = (like(form, tau), like(given, tau), form)
-        converted, given, _ = self._converted[kind]
-        return converted, given
+        converted = self._geometry.converted(form, tau)
+        if id(converted) not in self._given:
+            if len(self._given) == KEPT:
+                del self._given[next(iter(self._given))]
+            self._given[id(converted)] = (like(form.given(self._pinned.values), tau), converted)
+        return converted, self._given[id(converted)][0]
