@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from bench.rows import Row, least
-from dadiff.behaviours import Known, Pin
-from dadiff.behaviours.bounded import Bounded
+from dadiff.behaviours import Known, Limited, Pin
 from dadiff.behaviours.stages import Stages
 from dadiff.systems import Bounds, Linear, double_integrator
 
@@ -51,7 +50,7 @@ def within_bounds(plans: int = 20) -> list[Row]:
     limit = 0.5 * np.abs(layout.inputs(tau)).max()
     x_init = layout.states(tau)[:, 0]
     known = Known().fit(layout, system)
-    bounded = Bounded.by(known, Bounds(input_low=-limit, input_high=limit))
+    bounded = Limited(known, Bounds(input_low=-limit, input_high=limit))
     ours = bounded.bind(pins=[Pin.initial_state(layout, x_init)])
     one = bounded.bind(pins=[Pin.initial_state(layout, x_init[:1])])
     G, g = Stages.constant(system.A, system.B, None, 30).matrix(layout)

@@ -1,7 +1,5 @@
 """Behaviours: the sets of admissible trajectories, what they are learned from, and the projections onto them."""
 
-from dadiff.behaviours.bounded import Bounded
-from dadiff.behaviours.clear import Clear
 from dadiff.behaviours.components import (
     Hankel,
     HankelLowRank,
@@ -20,6 +18,7 @@ from dadiff.behaviours.components import (
 from dadiff.behaviours.family import IdentifiedFamily
 from dadiff.behaviours.least_squares import Estimate, Transitions, least_squares
 from dadiff.behaviours.lifted import Lifted
+from dadiff.behaviours.limited import Limited
 from dadiff.behaviours.manifold import Manifold
 from dadiff.behaviours.pins import Pin
 from dadiff.behaviours.prediction import model_of, prediction_error
@@ -28,8 +27,6 @@ from dadiff.behaviours.sets import Dynamics, Everything, Rollout, Span, Trajecto
 from dadiff.behaviours.stages import Stages
 
 __all__ = [
-    "Bounded",
-    "Clear",
     "Dynamics",
     "Estimate",
     "Everything",
@@ -43,6 +40,7 @@ __all__ = [
     "KnownClear",
     "Koopman",
     "Lifted",
+    "Limited",
     "Manifold",
     "NoProjector",
     "Nominal",

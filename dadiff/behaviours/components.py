@@ -13,11 +13,10 @@ from typing import ClassVar, Literal, Protocol, TypeVar
 
 import numpy as np
 
-from dadiff.behaviours.bounded import Bounded
-from dadiff.behaviours.clear import Clear
 from dadiff.behaviours.hulls import Hull
 from dadiff.behaviours.least_squares import Offset, Transitions, least_squares, lifted, regressed
 from dadiff.behaviours.lifted import Lifted
+from dadiff.behaviours.limited import Limited
 from dadiff.behaviours.manifold import Manifold
 from dadiff.behaviours.pins import Pin
 from dadiff.behaviours.sets import Dynamics, Everything, InitialState, Rollout, Span, TrajectorySet, Uncertain
@@ -113,7 +112,7 @@ class Known:
     Args:
         initial_state: `fixed` projects onto the trajectories with x(0) = x_init.
         sweeps: for each projection onto nonlinear dynamics; more than one where a plan is projected once (post hoc).
-        bounds: `enforced` keeps to the system's bounds on states and inputs as well, where it has any.
+        bounds: `enforced` keeps to the system's bounds on states and inputs as well.
     """
 
     initial_state: InitialState = "free"
@@ -131,11 +130,11 @@ class Known:
         system: System | None = None,
         recording: Recording | None = None,
         demonstrations: np.ndarray | None = None,
-    ) -> Dynamics | Manifold | Bounded:
+    ) -> Dynamics | Manifold | Limited:
         """The trajectories of the system.
 
         Raises:
-            NotApplicableError: for bounds on a nonlinear system.
+            ConfigError: if bounds are to be enforced and the system has none.
         """
         system = _required(system, "known", "system")
         notes: dict[str, float] = {"rank": layout.rank}
@@ -154,7 +153,7 @@ class Nominal(Known):
         system: System | None = None,
         recording: Recording | None = None,
         demonstrations: np.ndarray | None = None,
-    ) -> Dynamics | Manifold | Bounded:
+    ) -> Dynamics | Manifold | Limited:
         """The trajectories of the nominal robot.
 
         Raises:
@@ -170,10 +169,10 @@ class Nominal(Known):
 
 @dataclass(frozen=True)
 class KnownClear:
-    """Known linear dynamics among discs: keeps clear of the obstacles of E as well.
+    """Known dynamics among discs: keeps clear of the obstacles of E as well; the first two states are a position.
 
     Args:
-        initial_state: as of `Known`.
+        initial_state, sweeps, bounds: as of `Known`.
         margin: by which discs are inflated, in metres.
         rounds: how often discs become half-planes about what was found.
     """
@@ -181,6 +180,8 @@ class KnownClear:
     initial_state: InitialState = "fixed"
     margin: float = 0.03
     rounds: int = 2
+    sweeps: int = 1
+    bounds: BoundsChoice = "ignored"
     needs: ClassVar[frozenset[str]] = SYSTEM
 
     def __post_init__(self) -> None:
@@ -193,16 +194,15 @@ class KnownClear:
         system: System | None = None,
         recording: Recording | None = None,
         demonstrations: np.ndarray | None = None,
-    ) -> Clear:
+    ) -> Limited:
         """The trajectories of the system, before it is told of discs.
 
         Raises:
-            NotApplicableError: for nonlinear systems.
+            ConfigError: if bounds are to be enforced and the system has none.
         """
-        dynamics = Known().fit(layout, system)
-        if not isinstance(dynamics, Dynamics):
-            raise NotApplicableError("projector known_clear: it keeps linear systems clear; use projector=known")
-        return Clear(dynamics, self.margin, self.rounds)
+        found = Known(sweeps=self.sweeps, bounds=self.bounds).fit(layout, system)
+        limited = found if isinstance(found, Limited) else Limited(found)
+        return replace(limited, margin=self.margin, rounds=self.rounds)
 
 
 @dataclass(frozen=True)
@@ -301,7 +301,7 @@ class Identified:
         features: terms of phi; none for linear dynamics.
         angles: indices of the states whose sines and cosines are features.
         ridge: weight of |Theta|^2 against the squared residuals, features scaled to deviation 1.
-        bounds: `enforced` keeps to the system's bounds on states and inputs as well, where it has any.
+        bounds: `enforced` keeps to the system's bounds on states and inputs as well.
     """
 
     initial_state: InitialState = "free"
@@ -334,11 +334,11 @@ class Identified:
         system: System | None = None,
         recording: Recording | None = None,
         demonstrations: np.ndarray | None = None,
-    ) -> Dynamics | Manifold | Bounded:
+    ) -> Dynamics | Manifold | Limited:
         """The trajectories of the estimated dynamics.
 
         Raises:
-            NotApplicableError: for bounds on nonlinear dynamics.
+            ConfigError: if bounds are to be enforced and the system has none.
         """
         data = transitions(self, layout, system, recording, demonstrations)
         notes: dict[str, float] = {"rank": layout.rank}
@@ -490,22 +490,21 @@ def transitions(
     return found[0] if len(found) == 1 else found[0] + found[1]
 
 
-def within(found: Dynamics | Manifold, bounds: BoundsChoice, system: System | None) -> Dynamics | Manifold | Bounded:
-    """What was found, within the system's bounds if they are enforced and it has any.
+def within(found: Dynamics | Manifold, bounds: BoundsChoice, system: System | None) -> Dynamics | Manifold | Limited:
+    """What was found, within the system's bounds if they are enforced.
 
     Raises:
-        NotApplicableError: if the dynamics are nonlinear.
+        ConfigError: if it has none.
     """
     if bounds == "ignored":
         return found
     limits = _required(system, "with bounds", "system").bounds
     if not limits.any:
-        return found
-    if isinstance(found, Manifold):
-        raise NotApplicableError(
-            "projector: bounds are held for linear dynamics only, and these are not; use projector.bounds=ignored"
+        raise ConfigError(
+            "projector: bounds are to be enforced, and the system has none; give it some, such as "
+            "system.bounds.input_low=-2 system.bounds.input_high=2, or use projector.bounds=ignored"
         )
-    return Bounded.by(found, limits)
+    return Limited(found, limits)
 
 
 def with_offset(terms: Sequence[Term], offset: Offset) -> tuple[Term, ...]:

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from dadiff.behaviours.bounded import Bounded
-from dadiff.behaviours.clear import Clear
 from dadiff.behaviours.lifted import Lifted
+from dadiff.behaviours.limited import Limited
 from dadiff.behaviours.manifold import Manifold
 from dadiff.behaviours.sets import Dynamics, TrajectorySet
 from dadiff.systems import Linear, System, TimeVarying
@@ -35,10 +34,10 @@ def prediction_error(learned: TrajectorySet, truth: System, tau: np.ndarray) -> 
 
 def model_of(behaviour: TrajectorySet | None) -> System | None:
     """The system that a set takes the robot for; None where it says nothing of a step: subspaces, lifted dynamics."""
+    if isinstance(behaviour, Limited):
+        behaviour = behaviour.dynamics
     if isinstance(behaviour, Manifold):
         return behaviour.system
-    if isinstance(behaviour, Bounded | Clear):
-        behaviour = behaviour.dynamics
     if not isinstance(behaviour, Dynamics):
         return None
     stages = behaviour.stages

@@ -18,7 +18,7 @@ from dadiff.errors import ShapeError
 from dadiff.trajectory.arrays import Array, like
 from dadiff.trajectory.covariance import Covariance
 
-Kind = Literal["dense", "blocks", "manifold", "bounded"]
+Kind = Literal["dense", "blocks", "manifold", "limited"]
 
 KEPT = 64  # metrics that a projection holds converted, the oldest given up first
 
@@ -30,10 +30,11 @@ class ProjectionInfo:
     Args:
         rank: degrees of freedom that are left.
         kind: `dense` matrices, a recursion over `blocks` in O(T), sweeps of it along a
-            `manifold`, or Newton steps with it, `bounded`.
+            `manifold`, or Newton steps within bounds and clear of discs, `limited`.
         iterations: of the last call; 1 for a closed form.
         residual: how far the last call's result is from the set, 0 where that is rounding.
         unconverged: plans of the last call that did not reach the set.
+        infeasible: those among them for which it is proven that the set holds none.
     """
 
     rank: int
@@ -41,6 +42,7 @@ class ProjectionInfo:
     iterations: int = 1
     residual: float = 0.0
     unconverged: int = 0
+    infeasible: int = 0
 
 
 class Form(Protocol):

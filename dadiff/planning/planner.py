@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 import torch
 
-from dadiff.behaviours import Clear, Pin, Projection, TrajectorySet
+from dadiff.behaviours import Limited, Pin, Projection, TrajectorySet
 from dadiff.diffusion.chain import Observe, Samples, Start, sample
 from dadiff.diffusion.context import Project
 from dadiff.diffusion.enforcement import Enforcement
@@ -180,7 +180,7 @@ class Planner:
         if self.behaviour is None or self.enforcement is None:
             return None
         start = (Pin.initial_state(self.layout, self.condition.get(E, "x_init")),) if self.starts_fixed else ()
-        behaviour = self.behaviour.among(self.condition, E) if isinstance(self.behaviour, Clear) else self.behaviour
+        behaviour = self.behaviour.among(self.condition, E) if isinstance(self.behaviour, Limited) else self.behaviour
         projection = behaviour.bind(self.coordinates, (*start, *pins), self.device)
         if not self.enforcement.affine and projection.affine:
             raise NotApplicableError(

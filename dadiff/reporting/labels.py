@@ -63,6 +63,7 @@ METRICS = {
     "violating": "share of plans that violate bounds",
     "largest_violation": "largest violation of bounds of all plans",
     "unconverged": "plans without a projection",
+    "infeasible": "plans proven to have none within limits",
     "prediction_error": "prediction error over T [deviations]",
     "principal_angle": "largest principal angle [rad]",
     "sampling_seconds": "sampling time [s]",

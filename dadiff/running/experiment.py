@@ -144,9 +144,14 @@ def cost_of_model(experiment: Experiment, model: System | None) -> dict[str, flo
 
 
 def unconverged(projection: Any) -> dict[str, float]:
-    """How many plans the last projection did not bring into the set; nothing of closed forms, which always do."""
+    """How many plans the last projection did not bring into the set, and for how many the set is proven to be empty.
+
+    Nothing of closed forms, which always do.
+    """
     info = projection.info
-    return {} if info.kind in ("dense", "blocks") else {"unconverged": info.unconverged}
+    if info.kind in ("dense", "blocks"):
+        return {}
+    return {"unconverged": info.unconverged} | ({"infeasible": info.infeasible} if info.kind == "limited" else {})
 
 
 def _observers(experiment: Experiment, environment: np.ndarray) -> tuple[ChainRecorder | None, Snapshots]:

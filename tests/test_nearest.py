@@ -4,20 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import torch
-from laws import composed, tolerance
+from laws import tolerance
 
-from dadiff.behaviours import Dynamics, Pin
-from dadiff.behaviours.clear import Clear, Limits, Nearest, Status, half_planes, nearest
-from dadiff.behaviours.stages import stages_of
-from dadiff.errors import NotApplicableError, ShapeError
-from dadiff.running.assembly import Experiment
-from dadiff.running.experiment import execute
+from dadiff.errors import ConfigError, ShapeError
+from dadiff.experts.nearest import Limits, Nearest, Status, half_planes, nearest
 from dadiff.systems import Linear, double_integrator
-from dadiff.tasks import LQR
-from dadiff.tasks.encodings import PathFrame
-from dadiff.tasks.obstacle_scores import collision_scores
-from dadiff.tasks.obstacles import Obstacles
 from dadiff.trajectory.layout import TrajectoryLayout
 
 SYSTEM, T, COUNT = double_integrator(process_noise=0.0), 20, 12
@@ -199,52 +190,19 @@ def test_plans_of_another_shape_are_refused(estimates: np.ndarray) -> None:
         nearest(TrajectoryLayout(4, 2, T + 1), estimates, *STAGES, Limits.nothing(LAYOUT, COUNT))
 
 
-# --- among the discs of an environment ------------------------------------------------------------------------------
+def test_an_entry_without_a_scale_is_refused(estimates: np.ndarray) -> None:
+    scale = np.ones(LAYOUT.size)
+    scale[5] = 0.0
+    with pytest.raises(ConfigError, match="no positive scale"):
+        nearest(LAYOUT, estimates, *STAGES, Limits.nothing(LAYOUT, COUNT), scale)
 
 
-def test_plans_that_enter_discs_are_brought_out_of_them_and_others_stay() -> None:
-    task = Obstacles()
-    cases = task.cases(SYSTEM, 60, np.random.default_rng(0))
-    layout = SYSTEM.layout(task.horizon)
-    free = PathFrame().encoder(task, SYSTEM).encode(cases.environment)[1]  # the obstacle-free optima
-    target = Clear(Dynamics(layout, stages_of(SYSTEM, task.horizon)), margin=0.03)
-    start = Pin.initial_state(layout, cases.x_init)
-    project = target.among(cases.condition, cases.environment).bind(pins=[start])
-    environments = task.decode(cases.environment)
-
-    def collisions(tau: np.ndarray) -> np.ndarray:
-        return collision_scores(environments, layout.states(tau)[:, None, :, :2])[0]["collision"][:, 0]
-
-    found = project(free)
-    assert collisions(free).mean() > 0.4
-    assert collisions(found).mean() < 0.05
-    assert project.info.unconverged <= 3
-    np.testing.assert_allclose(layout.states(found)[:, 0], cases.x_init, atol=1e-12)
-    np.testing.assert_allclose(project(cases.reference), cases.reference, atol=1e-9)  # clear already
-    torch.testing.assert_close(project(torch.tensor(free)), torch.tensor(found))
-
-
-def test_without_an_environment_it_is_the_projection_onto_the_dynamics(estimates: np.ndarray) -> None:
-    dynamics = Dynamics(LAYOUT, stages_of(SYSTEM, T))
-    np.testing.assert_array_equal(Clear(dynamics).bind()(estimates), dynamics.bind()(estimates))
-
-
-def test_a_condition_without_discs_is_refused(estimates: np.ndarray) -> None:
-    with pytest.raises(NotApplicableError, match="a condition with discs"):
-        Clear(Dynamics(LAYOUT, stages_of(SYSTEM, T))).among(LQR().condition(SYSTEM), np.zeros((1, 8)))
-
-
-def test_a_planner_keeps_clear_of_the_discs_of_what_it_is_asked(tmp_path) -> None:
-    """A real run, hardly trained: without the projection its plans collide."""
-    small = (
-        "task=obstacles",
-        "training.steps=20",
-        "denoiser.width=32",
-        "dataset.train_size=100",
-        "dataset.test_size=10",
-    )
-    rest = ("evaluation.samples=2", "device=cpu", "progress=false", f"output_dir={tmp_path}", "enforcement=post_hoc")
-    known, clear = (
-        execute(Experiment.of(composed(*small, *rest, f"projector={name}"))) for name in ("known_fixed", "known_clear")
-    )
-    assert clear.metrics["collision_rollout"] < 0.7 * known.metrics["collision_rollout"]
+def test_limits_say_what_is_exceeded(estimates: np.ndarray) -> None:
+    given = limits(estimates, inputs=0.8, discs=True)
+    found = nearest(LAYOUT, estimates, *STAGES, given)
+    np.testing.assert_allclose(given.exceeded(LAYOUT, found.tau)[found.found], 0, atol=1e-9)
+    tau = given.clip(estimates)
+    tau[:, -1] += 1.3 - tau[:, -1]  # the last input, whose bound is 0.8
+    free = Limits.nothing(LAYOUT, COUNT)
+    boxes = Limits(given.low, given.high, free.normal, free.offset)
+    np.testing.assert_allclose(boxes.exceeded(LAYOUT, tau), 0.5)
