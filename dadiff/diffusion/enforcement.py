@@ -15,6 +15,7 @@ from typing import ClassVar, Literal, Protocol
 from dadiff.diffusion.context import Context
 from dadiff.diffusion.samplers import Step
 from dadiff.diffusion.schedule import Schedule
+from dadiff.errors import ConfigError
 from dadiff.trajectory.layout import Array
 
 
@@ -74,6 +75,28 @@ class PostHoc(Never):
     def end(self, tau: Array, at: Context) -> Array:
         """P(tau)."""
         return at.project(tau)
+
+
+@dataclass(frozen=True)
+class Repeated(Never):
+    """P after the last step, again and again from what it gave: for sets that one projection only comes nearer to.
+
+    Args:
+        times: how often.
+    """
+
+    times: int = 10
+
+    def __post_init__(self) -> None:
+        if self.times < 1:
+            raise ConfigError(f"enforcement: times is {self.times}; project at least once")
+
+    def end(self, tau: Array, at: Context) -> Array:
+        """P(tau), begun at the last P(tau)."""
+        projected = at.project(tau)
+        for _ in range(self.times - 1):
+            projected = at.project(tau, None, projected)
+        return projected
 
 
 @dataclass(frozen=True)
