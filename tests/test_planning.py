@@ -272,10 +272,12 @@ def test_the_shell_gives_the_plans_of_python(tmp_path, capsys):
     one = planner()
     file = str(one.save(tmp_path / "robot.zip"))
     main([file, "--x-init", "0,0,0.5,0", "--target=1,2,0,0", "--samples", "3", "--seed", "1",
-          "--output", str(tmp_path / "p.npz"), "--plot", str(tmp_path / "p.png")])  # fmt: skip
+          "--output", str(tmp_path / "p.npz"), "--plot", str(tmp_path / "p.png"),
+          "--animate", str(tmp_path / "p.gif")])  # fmt: skip
     with np.load(tmp_path / "p.npz") as stored:
         np.testing.assert_array_equal(stored["states"], plan_of(one).states)
     assert (tmp_path / "p.png").stat().st_size > 10_000
+    assert (tmp_path / "p.gif").stat().st_size > 10_000
     (tmp_path / "case.yaml").write_text("x_init: [0, 0, 0.5, 0]\ntarget: [1, 2, 0, 0]\n")
     main([file, "--condition", str(tmp_path / "case.yaml")])
     assert "plan" in capsys.readouterr().out

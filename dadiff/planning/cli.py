@@ -15,7 +15,7 @@ DESCRIPTION = """Plans of a trained planner, for one condition.
 The fields of the condition are given by name, numbers separated by commas:
   dadiff-plan robot.zip --x-init 0,0,0,0 --target 1,2,0,0 --samples 4 --output plan.csv --plot plan.png
 or, where it has more than numbers, in a yaml file with the same names:
-  dadiff-plan robot.zip --condition case.yaml
+  dadiff-plan robot.zip --condition case.yaml --animate plan.gif
 """
 
 
@@ -36,6 +36,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--seed", type=int, default=0, help="of the noise (default: 0)")
     parser.add_argument("--output", type=Path, help="write the plans to .csv or .npz (default: print the table)")
     parser.add_argument("--plot", type=Path, help="draw the plans into this file")
+    parser.add_argument("--animate", type=Path, help="film robots that execute the plans into this .gif or .mp4")
     parser.add_argument("--components", default="", help="packages besides dadiff that the file may name, by commas")
     return parser
 
@@ -47,16 +48,21 @@ def _plan(options: argparse.Namespace, fields: Mapping[str, Any]) -> None:
         raise DataError(f"--samples is {options.samples}; it must be at least 1")
     planner = Planner.load(options.planner, [name for name in options.components.split(",") if name])
     given = {**(_from_yaml(options.condition) if options.condition else {}), **fields}
-    plans = planner.plan(samples=options.samples, seed=options.seed, **given)
+    environment = planner.task.environment(planner.system, given)
+    plans = planner.plan(environment, samples=options.samples, seed=options.seed)
     if plans.diverged_at is not None:
         raise DataError(f"{options.planner}: the plans diverged at step {plans.diverged_at}; nothing is written")
     if options.plot:
         from dadiff.planning.drawing import draw
 
         print(f"drawn in {draw(plans, options.plot)}")
+    if options.animate:
+        from dadiff.planning.animation import animate
+
+        print(f"filmed in {animate(planner, plans, environment, options.animate)}")
     if options.output:
         print(f"written to {plans.save(options.output)}")
-    elif not options.plot:
+    elif not (options.plot or options.animate):
         print(plans.table().to_string(index=False, float_format=lambda value: f"{value:.5g}"))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -22,6 +23,7 @@ PROJECTORS = {
 ENFORCEMENTS = {
     "none": "none",
     "post_hoc": "once at the end",
+    "post_hoc_repeated": "at the end",
     "normalised": "every step",
     "convex": "convex",
     "clean_estimate": "on the clean estimate",
@@ -34,6 +36,12 @@ WORDS: dict[str, dict[str, str]] = {
     "initial_state": {"fixed": "x(0) fixed", "free": "x(0) free"},
     "sampler.last_step_noise": {"True": "with last-step noise", "False": "without last-step noise"},
     "denoiser": {"gaussian": "exact denoiser"},
+    "enforcement.metric": {
+        "estimate": "metric of the estimate",
+        "diagonal": "diagonal metric",
+        "standardised": "standardised metric",
+        "physical": "physical metric",
+    },
 }
 CHOICES = (*WORDS, "task", "sampler", "schedule", "training", "system")
 SYMBOLS = {
@@ -65,6 +73,7 @@ METRICS = {
     "unconverged": "plans without a projection",
     "infeasible": "plans proven to have none within limits",
     "prediction_error": "prediction error over T [deviations]",
+    "model_cost_ratio": "cost of optima of the model / optimal cost",
     "principal_angle": "largest principal angle [rad]",
     "sampling_seconds": "sampling time [s]",
     "projection_seconds": "time per projection [s]",
@@ -100,8 +109,14 @@ FLOORS = {"cost_ratio": 1.0, "median_cost_ratio": 1.0}
 SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
+EPISODES = re.compile(r"closed_loop_(?P<what>|same_|time_)(?P<controller>[a-z]+)_(?P<every>\d+)")
+OVER = {"": "", "same_": " / the expert's", "time_": ": time / the expert's"}
+
+
 def metric_name(metric: str) -> str:
     """A metric in words."""
+    if match := EPISODES.fullmatch(metric):
+        return f"{match['controller']}, every {match['every']}{OVER[match['what']]}"
     return METRICS.get(metric, metric.replace("_", " "))
 
 

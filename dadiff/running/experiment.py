@@ -255,7 +255,8 @@ def examples(experiment: Experiment, plans: Plans) -> dict[str, np.ndarray]:
     states and rollout_states (cases, samples, T+1, n), inputs (cases, samples, T, m), reference_states (cases, T+1, n),
     reference_inputs (cases, T, m), and environment_* (cases, ...), the channels of E. Of a fleet all these have a
     first dimension of a few robots that differ most, `robots` (k,) says which ones, and their first case is the same.
-    Names and units of states and inputs lie beside them, see `_named`.
+    Names and units of states and inputs lie beside them, see `_named`; where the robot has a shape, `outlines`
+    (cases, samples, T+1, k, 2) shows it as it replays its plans.
     """
     layout, cases, count = experiment.layout, experiment.cases, experiment.parts.evaluation.examples
     system, shown = _shown(experiment.target)
@@ -266,10 +267,12 @@ def examples(experiment: Experiment, plans: Plans) -> dict[str, np.ndarray]:
     states, inputs = layout.split(planned)
     reference_states, reference_inputs = layout.split(reference)
     noised = _noised(experiment, cases.reference[(*plans.snapshots.plan[:-1], 0)], steps)
+    rollout = layout.states(replay(system, layout, planned, E["x_init"]))
     return {
         "states": states,
         "inputs": inputs,
-        "rollout_states": layout.states(replay(system, layout, planned, E["x_init"])),
+        "rollout_states": rollout,
+        **_outlines(system, rollout),
         "reference_states": reference_states,
         "reference_inputs": reference_inputs,
         **{f"environment_{name}": values for name, values in E.items()},
@@ -279,6 +282,12 @@ def examples(experiment: Experiment, plans: Plans) -> dict[str, np.ndarray]:
         **({} if shown is Ellipsis else {"robots": shown}),
         **_named(layout),
     }
+
+
+def _outlines(system: System, rollout: np.ndarray) -> dict[str, np.ndarray]:
+    """`outlines` of the robot along rollout_states (..., T+1, n), if it is more than a point."""
+    found = system.outline(rollout)
+    return {"outlines": found} if found.shape[-2] > 1 else {}
 
 
 def _named(layout: TrajectoryLayout) -> dict[str, np.ndarray]:

@@ -16,7 +16,9 @@ from dadiff.errors import ConfigError
 from dadiff.systems.integrators import double_integrator
 from dadiff.systems.linear import Linear
 from dadiff.systems.nonlinear import Continuous, integrate
-from dadiff.systems.system import Bounds, Limits
+from dadiff.systems.system import Bounds, Limits, turned
+
+ARROWHEAD = 0.1 * np.array([[-1.5, 1.2], [2, 0], [-1.5, -1.2], [-0.8, 0], [-1.5, 1.2]])  # m
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,6 +59,10 @@ class Unicycle(Continuous):
         f_x[..., 1, 2], f_x[..., 1, 3] = speed * cos, sin
         f_u[..., 2, 1] = f_u[..., 3, 0] = 1.0
         return f_x, f_u
+
+    def outline(self, states: np.ndarray) -> np.ndarray:
+        """An arrowhead that points where it looks."""
+        return turned(ARROWHEAD, states[..., 2], states[..., :2])
 
 
 class Transformation(Protocol):
@@ -162,6 +168,10 @@ class Flat(Linear):
                 states[..., t + 1, :] = self.transformation.forward(x)
                 before = inputs[..., t, :]
         return states
+
+    def outline(self, states: np.ndarray) -> np.ndarray:
+        """Of the robot at flat states (..., n)."""
+        return self.robot.outline(self.transformation.start(states))
 
     def _driven(self, x: np.ndarray, w: np.ndarray) -> np.ndarray:
         """dx/dt of the robot under the transformation's feedback."""

@@ -11,9 +11,10 @@ import numpy as np
 from dadiff.errors import ConfigError
 from dadiff.systems.families import Family, Ranges, Robots
 from dadiff.systems.nonlinear import Continuous
-from dadiff.systems.system import Bounds, Limits
+from dadiff.systems.system import Bounds, Limits, turned
 
 GRAVITY = 9.81  # m/s^2
+ROTORS_AND_BEAM = 0.1 * np.array([[-4, 1], [-2, 1], [-3, 1], [-3, 0], [3, 0], [3, 1], [2, 1], [4, 1]])  # m
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,6 +75,10 @@ class PlanarQuadrotor(Continuous):
         f_x[..., 3, 3] = f_x[..., 4, 4] = -c
         f_u[..., 3, 0], f_u[..., 4, 0], f_u[..., 5, 1] = -a * sin, a * cos, b
         return f_x, f_u
+
+    def outline(self, states: np.ndarray) -> np.ndarray:
+        """A beam, and a rotor at each end."""
+        return turned(ROTORS_AND_BEAM, states[..., 2], states[..., :2])
 
     def _parameters(self, x: np.ndarray) -> list[float | np.ndarray]:
         """a, b, c with as many dimensions as the points have: robots first."""

@@ -77,6 +77,13 @@ class Bounds:
         return any(np.isfinite(bound).any() for bound in vars(self).values())
 
 
+def turned(points: np.ndarray, angle: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """Points (k, 2) of a body turned by angles (...) and moved to places (..., 2), in the plane: (..., k, 2)."""
+    cos, sin = np.cos(angle)[..., None], np.sin(angle)[..., None]
+    x, y = points[:, 0], points[:, 1]
+    return np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1) + place[..., None, :]
+
+
 def _spread(value: float | np.ndarray, size: int, name: str) -> np.ndarray:
     """(size,) from a number or (size,)."""
     array = np.asarray(value, dtype=np.float64)
@@ -173,6 +180,13 @@ class System(ABC):
     def singular(self, states: np.ndarray) -> np.ndarray | None:
         """At how many steps of states (..., T+1, n) a change of coordinates breaks down, (...); None without one."""
         return None
+
+    def outline(self, states: np.ndarray) -> np.ndarray:
+        """What a picture shows of the robot at states (..., n): a line through points (..., k, 2) of the plane.
+
+        The plane is that of the first two states; one point where nothing is known of the robot's shape.
+        """
+        return states[..., None, :2]
 
     def take(self, index: Sequence[int] | np.ndarray) -> Self:
         """The robots at `index`, as a system of so many.

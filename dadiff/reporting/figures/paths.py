@@ -1,6 +1,7 @@
 """Paths in the plane: a sample of the data with waypoints and discs, and plans of several methods beside the optimum.
 
-Fig. 3 (a, b) of the paper; on the fleet a row a robot. The first two states are the position.
+Fig. 3 (a, b) of the paper; on the fleet a row a robot. The first two states are the position. Where runs stored the
+outline of their robot, it is drawn at some times of the replay.
 """
 
 from __future__ import annotations
@@ -36,22 +37,24 @@ class Scene:
 
 @dataclass(frozen=True)
 class Path:
-    """Positions (T+1, 2) of one plan, and of the replay of its inputs."""
+    """Positions (T+1, 2) of one plan, and of the replay of its inputs; outlines (times, k, 2) of the robot in it."""
 
     label: str
     axes: dict[str, Any]
     planned: np.ndarray
     replayed: np.ndarray | None
+    outlines: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
 class Panel:
-    """One picture: the optimum (T+1, 2) and the plans drawn over it."""
+    """One picture: the optimum (T+1, 2) and the plans drawn over it; `channels` names its axes."""
 
     title: str
     scene: Scene
     optimum: np.ndarray
     paths: list[Path]
+    channels: tuple[str, str]
 
 
 @dataclass(frozen=True)
@@ -69,7 +72,7 @@ class Paths:
         figure, axes = panels(len(self.panels), across, width=PANEL_SIDE, height=PANEL_SIDE + 0.15)
         for ax, panel in zip(axes, self.panels, strict=True):
             _draw_panel(ax, panel)
-            _window(ax, [p for p in self.panels if p.optimum is panel.optimum])
+            window(ax, [p for p in self.panels if p.optimum is panel.optimum])
         if self.across <= 3:
             letter(axes)
         if any(path.replayed is not None for panel in self.panels for path in panel.paths):
@@ -79,14 +82,19 @@ class Paths:
         return figure
 
 
-def _draw_panel(ax: Axes, panel: Panel) -> None:
-    for x, y, r in panel.scene.discs:
+def draw_scene(ax: Axes, scene: Scene, optimum: np.ndarray) -> None:
+    """What lies in the plane, and the optimum (T+1, 2)."""
+    for x, y, r in scene.discs:
         ax.add_patch(Circle((x, y), r, fc="#e0604c", alpha=0.3, lw=0))
-    ax.plot(*panel.optimum.T, color=INK, lw=1.2, ls=(0, (3, 2)), label="optimum", zorder=3)
-    ax.plot(*panel.optimum[0], "o", color=INK, ms=4.5, zorder=4, label="start")
-    ax.plot(*panel.scene.target.T, "*", color="#d03a2b", ms=9, mew=0, zorder=4, label="target")
-    if len(panel.scene.waypoints):
-        ax.plot(*panel.scene.waypoints.T, "o", color="#3566c8", ms=5, zorder=4, label="waypoint")
+    ax.plot(*optimum.T, color=INK, lw=1.2, ls=(0, (3, 2)), label="optimum", zorder=3)
+    ax.plot(*optimum[0], "o", color=INK, ms=4.5, zorder=4, label="start")
+    ax.plot(*scene.target.T, "*", color="#d03a2b", ms=9, mew=0, zorder=4, label="target")
+    if len(scene.waypoints):
+        ax.plot(*scene.waypoints.T, "o", color="#3566c8", ms=5, zorder=4, label="waypoint")
+
+
+def _draw_panel(ax: Axes, panel: Panel) -> None:
+    draw_scene(ax, panel.scene, panel.optimum)
     for rank, path in enumerate(panel.paths):
         look = look_of(path.axes)
         width = max(3.2 - 0.7 * rank, 1.0) if len(panel.paths) > 1 else 1.5
@@ -95,14 +103,18 @@ def _draw_panel(ax: Axes, panel: Panel) -> None:
         tag(path.label, plan)
         if path.replayed is not None:
             tag(path.label, *ax.plot(*path.replayed.T, color=look.colour, ls=REPLAY, lw=1.8))
+        for outline in [] if path.outlines is None else path.outlines:
+            tag(path.label, *ax.plot(*outline.T, color=look.colour, lw=1.1, alpha=0.7))
     ax.set_title("\n".join(textwrap.wrap(panel.title, 30)))
-    ax.set_xlabel("x position")
-    ax.set_ylabel("y position")
+    ax.set_xlabel(panel.channels[0])
+    ax.set_ylabel(panel.channels[1])
 
 
-def _window(ax: Axes, shared: list[Panel]) -> None:
+def window(ax: Axes, shared: list[Panel]) -> None:
     """Equal axes around all paths of the row, ignoring how far a poor plan strays."""
-    points = np.concatenate([shared[0].optimum, shared[0].scene.target, *(p.planned for s in shared for p in s.paths)])
+    shown = [p for panel in shared for p in panel.paths]
+    bodies = [p.outlines.reshape(-1, 2) for p in shown if p.outlines is not None]
+    points = np.concatenate([shared[0].optimum, shared[0].scene.target, *(p.planned for p in shown), *bodies])
     optimum = np.concatenate([shared[0].optimum, shared[0].scene.target])
     reach = 1.6 * max(np.ptp(optimum, axis=0).max(), 1.0)
     centre = (optimum.max(0) + optimum.min(0)) / 2
@@ -125,6 +137,7 @@ def collect(
     sample_of_data: bool = False,
     by: str | None = None,
     apart: bool = False,
+    outlines: int = 0,
 ) -> Paths:
     """Plans of one case from the same noise: the first seed, the first plan.
 
@@ -134,41 +147,42 @@ def collect(
         sample_of_data: a first panel with the optimum alone.
         by: an axis with a panel of its own for each value.
         apart: a panel a method, with the replay of its inputs, instead of one panel for all.
+        outlines: at how many times the robot itself is drawn, where runs stored what it looks like.
     """
     methods = evidence.methods(cells)
-    used = [m for m in methods if m.finished and _in_a_plane(m.finished[0].examples)]
+    used = [m for m in methods if m.finished and in_a_plane(m.finished[0].examples)]
     values = list(dict.fromkeys(m.axes.get(by) for m in used)) if by else [None]
+    channels = channels_of(used[0].finished[0].examples) if used else ("", "")
     shown, drawn = [name for name in varying(methods) if name != by], []
     rows: list[int] | list[None] = robots or [None]
     for robot in rows if used else []:
-        case = _most_telling(used[0], robot) if case is None else case
-        scene, optimum = _scene(used[0], robot, case)
-        paths = [_path(method, robot, case, shown, replay=apart) for method in used]
+        case = most_telling(used[0], robot) if case is None else case
+        scene, optimum = scene_of(used[0], robot, case)
+        paths = [_path(method, robot, case, shown, replay=apart, outlines=outlines) for method in used]
         title = "plans" if robot is None else f"robot {used[0].finished[0].examples['robots'][robot]}"
         if sample_of_data:
-            drawn.append(Panel("a sample of the data", scene, optimum, []))
+            drawn.append(Panel("a sample of the data", scene, optimum, [], channels))
         if apart:
-            drawn += [
-                Panel(f"{title}: {p.label}" if robot is not None else p.label, scene, optimum, [p]) for p in paths
-            ]
+            titles = [f"{title}: {p.label}" if robot is not None else p.label for p in paths]
+            drawn += [Panel(t, scene, optimum, [p], channels) for t, p in zip(titles, paths, strict=True)]
         else:
             for value in values:
                 here = [path for path in paths if by is None or path.axes.get(by) == value]
                 condition = f", {axis_value(by, value)}" if by and len(values) > 1 else ""
-                drawn.append(Panel(title + condition, scene, optimum, _told_apart(here)))
+                drawn.append(Panel(title + condition, scene, optimum, _told_apart(here), channels))
     across = min(len(used), 6 if robots else 4) if apart else min(max(len(values) + sample_of_data, 2), 3)
     notes = [f"{method_name(m.axes, varying(methods))}: {m.outcome}" for m in methods if m.lost]
     return Paths(drawn, across, [m.finished[0].key for m in used], notes)
 
 
-def _in_a_plane(stored: Mapping[str, np.ndarray]) -> bool:
+def in_a_plane(stored: Mapping[str, np.ndarray]) -> bool:
     return "environment_target" in stored and stored["states"].shape[-1] >= 2
 
 
-def _most_telling(method: Method, robot: int | None) -> int:
+def most_telling(method: Method, robot: int | None) -> int:
     """The stored case whose optimum comes closest to a disc; the first where there are none."""
     stored = method.finished[0].examples["reference_states"]
-    scenes = [_scene(method, robot, case) for case in range(len(stored if robot is None else stored[robot]))]
+    scenes = [scene_of(method, robot, case) for case in range(len(stored if robot is None else stored[robot]))]
     return int(np.argmin([_clearance(scene.discs, optimum) for scene, optimum in scenes]))
 
 
@@ -178,15 +192,32 @@ def _clearance(discs: np.ndarray, path: np.ndarray) -> float:
     return float(apart.min(initial=np.inf))
 
 
-def _of(method: Method, name: str, robot: int | None, case: int) -> np.ndarray:
+def of_case(method: Method, name: str, robot: int | None, case: int) -> np.ndarray:
     """An example array of one case; robots lead where there are any."""
     stored = method.finished[0].examples[name]
     return stored[case] if robot is None else stored[robot, case]
 
 
-def _path(method: Method, robot: int | None, case: int, shown: list[str], *, replay: bool) -> Path:
-    planned, replayed = (_of(method, name, robot, case)[0, :, :2] for name in ("states", "rollout_states"))
-    return Path(method_name(method.axes, shown), method.axes, planned, replayed if replay else None)
+def _path(method: Method, robot: int | None, case: int, shown: list[str], *, replay: bool, outlines: int) -> Path:
+    planned, replayed = (of_case(method, name, robot, case)[0, :, :2] for name in ("states", "rollout_states"))
+    times = np.linspace(0, len(planned) - 1, outlines).round().astype(int)
+    bodies = outlines_of(method, robot, case, times) if outlines else None
+    return Path(method_name(method.axes, shown), method.axes, planned, replayed if replay else None, bodies)
+
+
+def outlines_of(method: Method, robot: int | None, case: int, times: np.ndarray) -> np.ndarray | None:
+    """The robot's outline at times of the replay, (times, k, 2); None where none was stored."""
+    if "outlines" not in method.finished[0].examples:
+        return None
+    return of_case(method, "outlines", robot, case)[0][times]
+
+
+def channels_of(stored: Mapping[str, np.ndarray]) -> tuple[str, str]:
+    """What the first two states are called, with their units."""
+    names = stored["state_names"][:2].tolist() if "state_names" in stored else ["x position", "y position"]
+    units = stored["state_units"][:2].tolist() if "state_units" in stored else ["", ""]
+    first, second = (f"{name} [{unit}]" if unit else name for name, unit in zip(names, units, strict=True))
+    return first, second
 
 
 def _told_apart(paths: list[Path]) -> list[Path]:
@@ -203,14 +234,14 @@ def _told_apart(paths: list[Path]) -> list[Path]:
     return distinct
 
 
-def _scene(method: Method, robot: int | None, case: int) -> tuple[Scene, np.ndarray]:
-    optimum = _of(method, "reference_states", robot, case)
+def scene_of(method: Method, robot: int | None, case: int) -> tuple[Scene, np.ndarray]:
+    optimum = of_case(method, "reference_states", robot, case)
     waypoints, discs = (_slots(method, f"environment_{name}", robot, case) for name in ("waypoints", "obstacles"))
-    target = _of(method, "environment_target", robot, case)
+    target = of_case(method, "environment_target", robot, case)
     return Scene(waypoints[:, :2], target[None, :2], discs), optimum[:, :2]
 
 
 def _slots(method: Method, name: str, robot: int | None, case: int) -> np.ndarray:
     """The filled slots of a channel of E, (k, 3); none where E has no such channel."""
     stored = name in method.finished[0].examples
-    return present(_of(method, name, robot, case)) if stored else np.empty((0, 3))
+    return present(of_case(method, name, robot, case)) if stored else np.empty((0, 3))
