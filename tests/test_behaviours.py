@@ -575,7 +575,7 @@ def test_the_residual_of_true_trajectories_has_the_stated_covariance():
     found, stated = [], []
     for seed in range(150):
         recording = GaussianExcitation(length=300, seed=seed).record(system)
-        fitted = IdentifiedSoft().fit(layout, system, recording, shown)
+        fitted = IdentifiedSoft(residual="averaged").fit(layout, system, recording, shown)
         found.append(np.square(fitted.stages.residual(layout, shown)).mean(axis=-2))
         stated.append(np.square(fitted.spread).sum(axis=-1).reshape(HORIZON, -1))
     np.testing.assert_allclose(np.mean(found, axis=(0, 2)), np.mean(stated, axis=(0, 2)), rtol=0.2)
@@ -588,7 +588,8 @@ def test_with_more_data_it_becomes_the_hard_projection():
     for length, learn_from in ((20, "recording"), (400, "recording"), (400, "both")):
         recording = GaussianExcitation(length=length, process_noise=0.5, seed=1).record(system)
         given = (layout, system, recording, shown)
-        soft, hard = (kind(learn_from=learn_from).fit(*given) for kind in (IdentifiedSoft, Identified))
+        soft = IdentifiedSoft(learn_from=learn_from, residual="averaged").fit(*given)
+        hard = Identified(learn_from=learn_from).fit(*given)
         apart.append(np.abs(soft.bind()(z) - hard.bind()(z)).mean())
         deviations.append(soft.notes["residual_deviation"])
     assert apart[0] > 5 * apart[1] > 5 * apart[2]

@@ -15,6 +15,7 @@ from dadiff.behaviours.components import (
     RolloutProjector,
     pins,
 )
+from dadiff.behaviours.doubt import Doubted
 from dadiff.behaviours.family import IdentifiedFamily
 from dadiff.behaviours.least_squares import Estimate, Transitions, least_squares
 from dadiff.behaviours.lifted import Lifted
@@ -27,6 +28,7 @@ from dadiff.behaviours.sets import Dynamics, Everything, Rollout, Span, Trajecto
 from dadiff.behaviours.stages import Stages
 
 __all__ = [
+    "Doubted",
     "Dynamics",
     "Estimate",
     "Everything",

@@ -13,6 +13,7 @@ from typing import ClassVar, Literal, Protocol, TypeVar
 
 import numpy as np
 
+from dadiff.behaviours.doubt import Doubted
 from dadiff.behaviours.hulls import Hull
 from dadiff.behaviours.least_squares import Offset, Transitions, least_squares, lifted, regressed
 from dadiff.behaviours.lifted import Lifted
@@ -354,15 +355,21 @@ class Identified:
 class IdentifiedSoft(Identified):
     """Dynamics estimated by least squares, each direction trusted by how well it is known.
 
-    The estimate's posterior covariance says how far a trajectory of the true system may lie from G tau = g; it is
-    averaged over the demonstrations. See `dadiff.behaviours.Uncertain`; `enforcement=conditional` weighs it against
-    what the denoiser leaves open. With much data it is `Identified`, with little it projects hardly.
+    The estimate's posterior covariance says how far a trajectory of the true system may lie from G tau = g, and
+    `enforcement=conditional` weighs that against what the denoiser leaves open. With much data it is `Identified`, with
+    little it projects hardly.
+
+    Args:
+        residual: its covariance is that of `each` plan (`dadiff.behaviours.Doubted`), or `averaged` over the
+            demonstrations (`Uncertain`), which long trajectories need.
     """
+
+    residual: Literal["each", "averaged"] = "each"
 
     @property
     def needs(self) -> frozenset[str]:
-        """What it learns from, and demonstrations, which say what trajectories look like."""
-        return super().needs | {"demonstrations"}
+        """What it learns from; to average, demonstrations, which say what trajectories look like."""
+        return super().needs | ({"demonstrations"} if self.residual == "averaged" else set())
 
     def fit(
         self,
@@ -370,7 +377,7 @@ class IdentifiedSoft(Identified):
         system: System | None = None,
         recording: Recording | None = None,
         demonstrations: np.ndarray | None = None,
-    ) -> Uncertain:
+    ) -> Uncertain | Doubted:
         """The estimated dynamics, and the covariance of the residual."""
         if self.features:
             raise NotApplicableError(
@@ -381,10 +388,11 @@ class IdentifiedSoft(Identified):
                 "projector identified_soft: dynamics that are trusted in part are not held within bounds; use "
                 "projector=identified"
             )
-        shown = _required(demonstrations, "identified_soft", "dataset")
         data = transitions(self, layout, system, recording, demonstrations)
         estimate = least_squares(data, self.offset, known_offset(self.offset, system))
-        spread = estimate.residual_spread(*layout.split(shown))
+        if self.residual == "each":
+            return Doubted(layout, estimate.stages(layout.horizon), estimate.root, notes={"rank": layout.rank})
+        spread = estimate.residual_spread(*layout.split(_required(demonstrations, "identified_soft", "dataset")))
         deviation = float(np.sqrt(np.square(spread).sum(axis=-1).mean()))
         notes = {"rank": layout.rank, "residual_deviation": deviation}
         return Uncertain(layout, estimate.stages(layout.horizon), spread, notes=notes)

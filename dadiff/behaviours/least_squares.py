@@ -96,6 +96,13 @@ class Estimate:
         V = root[..., :, None, :, None] * _diagonal(np.sqrt(self.noise))[..., None, :, None, :]
         return V.reshape(*V.shape[:-4], V.shape[-4] * V.shape[-3], V.shape[-2] * V.shape[-1])
 
+    @property
+    def root(self) -> np.ndarray:
+        """L of shape (*robots, p, n, p n), with L L' the covariance of [A B c]' = theta, row by row."""
+        S, deviation = np.linalg.cholesky(self.spread), _diagonal(np.sqrt(self.noise))
+        L = S[..., :, None, :, None] * deviation[..., None, :, None, :]
+        return L.reshape(*L.shape[:-2], L.shape[-2] * L.shape[-1])
+
 
 def _diagonal(values: np.ndarray) -> np.ndarray:
     return values[..., :, None] * np.eye(values.shape[-1])

@@ -31,6 +31,15 @@ def join(arrays: Sequence[Array], axis: int) -> Array:
     return torch.cat(list(arrays), axis)
 
 
+def solve(A: Array, b: Array) -> Array:
+    """A^-1 b for A (..., k, k) and b (..., k, q)."""
+    if isinstance(A, np.ndarray):
+        return np.linalg.solve(A, b)
+    import torch
+
+    return torch.linalg.solve(A, b)
+
+
 def contiguous(array: Array) -> Array:
     """The same in the order of its dimensions, which makes many small products fast."""
     return np.ascontiguousarray(array) if isinstance(array, np.ndarray) else array.contiguous()
