@@ -9,11 +9,24 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from laws import composed
 
 from dadiff.errors import ConfigError, DataError, MissingExtraError
+from dadiff.evaluation import closed_loop
+from dadiff.planning import Planner
 from dadiff.planning.codec import Decoder, Encoder
-from dadiff.systems import MujocoFamily, MujocoRobot, Simulated, mujoco_robot
+from dadiff.running.assembly import Experiment
+from dadiff.running.experiment import execute
+from dadiff.systems import (
+    FeedbackExcitation,
+    GaussianExcitation,
+    MujocoFamily,
+    MujocoRobot,
+    Simulated,
+    mujoco_robot,
+)
 from dadiff.systems.mjcf import Mjcf, located, mujoco
+from dadiff.systems.rest import at_rest
 
 pytest.importorskip("mujoco", reason="the extra mujoco is not installed")
 
@@ -204,3 +217,57 @@ def test_without_the_extra_the_message_names_it(monkeypatch):
         mujoco()
     with pytest.raises(MissingExtraError, match=r"dadiff\[mujoco\]"):
         MujocoFamily("reacher").inside(1, np.random.default_rng(0))
+
+
+def test_where_it_rests():
+    robots = MujocoFamily("inverted_pendulum", **WITHIN_60_PERCENT).inside(3, np.random.default_rng(0))
+    held = np.linspace(-0.5, 0.5, 6).reshape(3, 2, 1)
+    x, u = at_rest(robots, held)
+    np.testing.assert_array_equal(x[..., :1], held)
+    np.testing.assert_allclose(robots.step(x, u), x, atol=1e-8)
+    np.testing.assert_allclose(x[..., 1], -0.001 / 0.6, rtol=1e-4)  # its pole is drawn askew
+    with pytest.raises(ConfigError, match=r"with its 2 leading states held it rests nowhere near \[0.0, 0.5\]"):
+        at_rest(robots, np.tile([0.0, 0.5], (3, 1, 1)))
+
+
+def test_a_recording_about_a_feedback_stays_where_the_robot_rests_and_obeys_it():
+    weak = {"input_low": -1.0, "input_high": 1.0}
+    robots = MujocoFamily("inverted_pendulum", bounds=weak, **WITHIN_60_PERCENT).inside(5, np.random.default_rng(0))
+    recorder = FeedbackExcitation(length=200, input_std=0.5, state_cost=(1.0, 1.0, 0.1, 0.1), input_cost=0.05, count=2)
+    recording = recorder.record(robots)
+    assert recording.states.shape == (5, 2, 201, 4)
+    np.testing.assert_array_equal(
+        robots.step(recording.states[:, :, :-1], recording.inputs), recording.states[:, :, 1:]
+    )
+    assert np.abs(recording.states[..., 1]).max() < 1.0
+    assert np.abs(recording.inputs).max() == 1.0  # no more than the motor gives
+    held = replace(recorder, hold=20, input_std=0.1).record(robots)
+    assert held.states.std() != recording.states.std()
+    fallen = GaussianExcitation(length=200, input_std=0.1).record(robots)
+    assert np.abs(fallen.states[..., 1]).max(axis=(1, 2)).min() > 1.0
+    with pytest.raises(ConfigError, match="hold is 0"):
+        FeedbackExcitation(hold=0)
+
+
+TINY = ["task.robots=3", "task.interpolation=2", "task.horizon=8", "dataset.train_size=4", "dataset.test_size=2"]
+TINY += ["training.steps=5", "denoiser.width=8", "denoiser.blocks=1", "sampler.num_steps=2", "progress=false"]
+TERMS = ["projector.initial_state=fixed", "projector.features=[constant,identity,trigonometric,control_affine]"]
+LEARNED = {
+    "known_fixed": [],
+    "identified": [*TERMS, "projector.angles=[1]", "projector.ridge=1e-8"],
+    "koopman": [],
+    "hankel_lowrank": ["projector.initial_state=fixed", "projector.offset=estimated"],
+}
+
+
+@pytest.mark.parametrize(("task", "projector"), zip(2 * ["pendulums", "reachers"], LEARNED, strict=True))
+def test_a_run_plans_and_replays_in_the_simulator(task, projector, tmp_path, monkeypatch):
+    monkeypatch.setattr(closed_loop, "TIMED_SECONDS", 0.0)
+    words = [f"task=manoeuvre_{task}", f"projector={projector}", *LEARNED[projector], "recording.length=100"]
+    run = execute(Experiment.of(composed(*TINY, *words, f"output_dir={tmp_path}")))
+    metrics = run.record.metrics
+    assert metrics["cost_ratio"] > 0.99
+    assert metrics["initial_state_error"] < 1e-12
+    if projector == "known_fixed":
+        assert metrics["gap_nrmse"] < 1e-6
+    assert Planner.load(run.folder).system.robots == (2,)

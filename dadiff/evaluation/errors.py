@@ -12,12 +12,21 @@ from dadiff.systems import System
 from dadiff.tasks import Cases, Scores
 from dadiff.trajectory.layout import TrajectoryLayout
 
+TINY = float(np.finfo(np.float64).tiny)
+
 VIOLATION = 1e-8
 """By how much a plan must exceed a bound to count as violating it: more than rounding in scaled coordinates."""
 
 
 def _squared(difference: np.ndarray) -> np.ndarray:
     return np.square(difference).sum(axis=-1)
+
+
+def _normalised(difference: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    """Root mean square (...) of differences (..., T+1, n), each state over its deviation in all references."""
+    deviation = reference.std(axis=tuple(range(reference.ndim - 1)))
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.sqrt(_squared(difference / np.maximum(deviation, TINY)).mean(axis=-1) / difference.shape[-1])
 
 
 def _to_horizon(values: np.ndarray) -> np.ndarray:
@@ -77,7 +86,10 @@ def _beyond(system: System, layout: TrajectoryLayout, tau: np.ndarray) -> np.nda
 def tracking_errors(
     system: System, layout: TrajectoryLayout, cases: Cases, planned: np.ndarray, rollout: np.ndarray
 ) -> Scores:
-    """State and input errors as planned and after replay, the gap between the two, and the dynamics' residual."""
+    """State and input errors as planned and after replay, the gap between the two, and the dynamics' residual.
+
+    `gap_nrmse` is the gap of a plan, each state over its deviation in all references, as a root mean square.
+    """
     x, u = layout.split(planned)
     x_replayed = layout.states(rollout)
     x_ref, u_ref = (part[..., None, :, :] for part in layout.split(cases.reference))
@@ -92,6 +104,7 @@ def tracking_errors(
         },
         per_plan={
             "initial_state_error": _squared(x[..., 0, :] - cases.x_init[..., None, :]),
+            "gap_nrmse": _normalised(x - x_replayed, layout.states(cases.reference)),
             **({} if singular is None else {"singular_steps": singular.astype(float)}),
         },
     )

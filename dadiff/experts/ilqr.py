@@ -20,7 +20,7 @@ from types import EllipsisType
 import numpy as np
 
 from dadiff.errors import ConfigError, ShapeError
-from dadiff.systems import System
+from dadiff.systems import Robots, System
 from dadiff.trajectory.layout import TrajectoryLayout
 
 _BACKTRACKS = 8
@@ -143,12 +143,13 @@ class Tracking:
         return off <= _ROUNDING * (1 + np.abs(tau).max(axis=-1))
 
     def take(self, index: Index) -> Tracking:
-        """The problems of plans `index`, where there is one system."""
+        """The problems of plans `index`, where there is one system; of robots `index`, where there are several."""
         if index is ...:
             return self
         pins = self.pins and (self.pins[0], self.pins[1][index])
         x_init = None if self.x_init is None else self.x_init[index]
-        return replace(self, reference=self.reference[index], x_init=x_init, pins=pins)
+        system = self.system.take(index) if isinstance(self.system, Robots) else self.system
+        return replace(self, system=system, reference=self.reference[index], x_init=x_init, pins=pins)
 
 
 @dataclass(frozen=True)
@@ -229,11 +230,18 @@ def solve(
     """
     plans = _Plans.of(problem, start)
     for _ in range(sweeps):
-        going: Index = ... if problem.system.robots else np.flatnonzero(~plans.ended)
+        going = _going(problem.system, plans.ended)
         plans.put(going, _sweep(problem.take(going), plans.take(going), tolerance))
         if plans.ended.all():
             break
     return Solution(plans.tau, problem.cost(plans.tau), plans.count, plans.converged)
+
+
+def _going(system: System, ended: np.ndarray) -> Index:
+    """The plans that have not ended, or the robots with such plans; all where robots cannot be taken one by one."""
+    if isinstance(system, Robots):
+        return np.flatnonzero(~ended.all(axis=-1))
+    return ... if system.robots else np.flatnonzero(~ended)
 
 
 def _sweep(problem: Tracking, plans: _Plans, tolerance: float) -> _Plans:

@@ -7,7 +7,7 @@ from dadiff.systems.linear import AffineSystem, Linear, TimeVarying, require_aff
 from dadiff.systems.mujoco import MujocoFamily, MujocoRobot, mujoco_robot
 from dadiff.systems.nonlinear import Continuous, Nonlinear, Simulated
 from dadiff.systems.quadrotors import PlanarQuadrotor, PlanarQuadrotors
-from dadiff.systems.recording import GaussianExcitation, Recording
+from dadiff.systems.recording import FeedbackExcitation, GaussianExcitation, Recording
 from dadiff.systems.system import Bounds, System
 
 __all__ = [
@@ -16,6 +16,7 @@ __all__ = [
     "Continuous",
     "DampedIntegrators",
     "Family",
+    "FeedbackExcitation",
     "GaussianExcitation",
     "LaggedIntegrators",
     "Linear",

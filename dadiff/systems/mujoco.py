@@ -276,6 +276,7 @@ class MujocoFamily(Family[MujocoRobots]):
             process_noise=self.process_noise,
             parameters=named,
             distance=self.ranges.distance(values),
+            family=self,
             **named,
             **_description(self._model, self.frame_skip, self.bounds),
         )

@@ -12,7 +12,9 @@ from dadiff.errors import ConfigError, NotApplicableError, ShapeError
 from dadiff.memory import check_fits
 from dadiff.randomness import numpy_generator
 from dadiff.systems.linear import TimeVarying
+from dadiff.systems.rest import at_rest
 from dadiff.systems.system import System
+from dadiff.trajectory.response import along
 
 
 @dataclass(frozen=True)
@@ -89,12 +91,69 @@ class GaussianExcitation:
             raise NotApplicableError(
                 "recording: the system varies in time, what is learned from recordings does not; use projector=known"
             )
+        inputs, noise = self._drawn(system)
+        x_init = np.zeros((*system.robots, self.count, system.state_dim))
+        return Recording(system.simulate(x_init, inputs, noise), inputs)
+
+    def _drawn(self, system: System) -> tuple[np.ndarray, np.ndarray]:
+        """White inputs (*robots, count, S, m) and process noise (*robots, count, S, n)."""
         rng = numpy_generator(self.seed, "recording")
         shape = (*system.robots, self.count, self.length)
         inputs = self.input_std * rng.standard_normal((*shape, system.input_dim))
         std = system.process_noise if self.process_noise is None else self.process_noise
         if np.shape(std) not in ((), (system.state_dim,)):
             raise ShapeError(f"recording: process_noise is {std}; expected a number or {system.state_dim} of them")
-        noise = np.asarray(std) * rng.standard_normal((*shape, system.state_dim))
-        x_init = np.zeros((*system.robots, self.count, system.state_dim))
-        return Recording(system.simulate(x_init, inputs, noise), inputs)
+        return inputs, np.asarray(std) * rng.standard_normal((*shape, system.state_dim))
+
+
+@dataclass(frozen=True)
+class FeedbackExcitation(GaussianExcitation):
+    """Experiments about a feedback that holds the system where it rests, for those that fall or drift away without.
+
+        u(t) = u_rest + K (x(t) - x_rest) + e(t),   e ~ N(0, input_std^2 I), each draw held for some steps
+
+    K is each robot's LQR gain, as linearised where it rests: whoever recorded it could hold it. Inputs are kept within
+    the system's bounds; what is recorded is what was applied.
+
+    Args:
+        hold: for how many steps a draw is held.
+        state_cost: diagonal of Q, a number for all states, or one for each.
+        input_cost: R = input_cost * I.
+    """
+
+    hold: int = 1
+    state_cost: float | Sequence[float] = 1.0
+    input_cost: float = 1.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.hold < 1 or not self.input_cost > 0 or not (np.asarray(self.state_cost) >= 0).all():
+            raise ConfigError(
+                f"recording: hold is {self.hold}, state_cost {self.state_cost} and input_cost {self.input_cost}; "
+                "expected at least 1, weights that are not negative, and a positive one"
+            )
+
+    def record(self, system: System) -> Recording:
+        """Γ of every robot of the system."""
+        dither, noise = self._drawn(system)
+        dither = dither[..., np.arange(self.length) // self.hold, :]
+        rest, still = at_rest(system, np.zeros((*system.robots, 1, 0)))
+        K, (low, high) = self.gain(system, rest, still), system.bounds.of_inputs(system.input_dim)
+        states, inputs = np.empty((*dither.shape[:-2], self.length + 1, system.state_dim)), np.empty_like(dither)
+        states[..., 0, :] = rest
+        for t in range(self.length):
+            wanted = still + along(K, states[..., t, :] - rest) + dither[..., t, :]
+            inputs[..., t, :] = np.clip(wanted, low, high)
+            states[..., t + 1, :] = system.step(states[..., t, :], inputs[..., t, :], t) + noise[..., t, :]
+        return Recording(states, inputs)
+
+    def gain(self, system: System, rest: np.ndarray, still: np.ndarray) -> np.ndarray:
+        """K (*robots, m, n) about x (*robots, 1, n) and u (*robots, 1, m)."""
+        import control
+
+        n, m = system.state_dim, system.input_dim
+        A, B, _ = system.linearise(rest, still)
+        Q = np.diag(np.broadcast_to(np.asarray(self.state_cost, dtype=np.float64), n))
+        pairs = zip(A.reshape(-1, n, n), B.reshape(-1, n, m), strict=True)
+        K = [-control.dlqr(a, b, Q, self.input_cost * np.eye(m))[0] for a, b in pairs]
+        return np.reshape(K, (*system.robots, m, n))

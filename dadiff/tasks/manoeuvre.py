@@ -1,9 +1,10 @@
 """The manoeuvre: nonlinear robots, from a moving start to rest at a target, at least quadratic cost.
 
-    min  sum_{t<T} |x(t) - x_target|_Q^2 + |u(t)|_R^2  +  w |x(T) - x_target|_Q^2     s.t.  x(t+1) = f(x(t), u(t))
+    min  sum_{t<T} |x(t) - x_rest|_Q^2 + |u(t) - u_rest|_R^2  +  w |x(T) - x_rest|_Q^2   s.t.  x(t+1) = f(x(t), u(t))
 
-As in the fleet the network sees trajectories of all training robots and is told start and target, not the robot.
-The expert is iterated LQR, each robot solved by its own.
+Each robot rests at the target in its own way, f(x_rest, u_rest) = x_rest. As in the fleet the network sees trajectories
+of all training robots and is told start and target, not the robot. The expert is iterated LQR, each robot solved by its
+own.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import numpy as np
 from dadiff.errors import ConfigError
 from dadiff.experts.ilqr import Metric, Solution, Tracking, solve
 from dadiff.systems import Family, Robots, System
+from dadiff.systems.rest import at_rest
 from dadiff.tasks.robots import ManyRobots, joined, scores_of
 from dadiff.tasks.task import Cases, Demonstrations, Scores, encoded
 from dadiff.trajectory import Channel, Layout
@@ -29,7 +31,8 @@ _SWEEPS = 200
 class Manoeuvre(ManyRobots):
     """E = [x_init; target], followed by what the network is told of the robot; see `ManyRobots`.
 
-    The target is given by the leading entries of the state; the others are 0 there, as are the inputs.
+    The target is given by the leading entries of the state; the others, and the inputs, are those with which the robot
+    rests there.
 
     Args:
         horizon: T.
@@ -127,7 +130,7 @@ class Manoeuvre(ManyRobots):
             start: tau to begin from; None begins at rest at the target.
         """
         ends = {name: self.condition(system).get(environment, name) for name in ("x_init", "target")}
-        return self.optimum(model or system, self._ends(system).pack(**ends), start).tau
+        return self.optimum(system, self._ends(system).pack(**ends), model, start).tau
 
     def goal(self, system: Robots, environment: np.ndarray) -> np.ndarray:
         """At rest at the target, (robots, ..., n)."""
@@ -150,15 +153,21 @@ class Manoeuvre(ManyRobots):
         layout = system.layout(self.horizon)
         return Metric(layout, Q, R, np.zeros((layout.size, 0)))
 
-    def optimum(self, system: System, environment: np.ndarray, start: np.ndarray | None = None) -> Solution:
-        """Each robot's optimum in environments [x_init; target] (robots, plans, c)."""
+    def optimum(
+        self,
+        system: Robots,
+        environment: np.ndarray,
+        model: System | None = None,
+        start: np.ndarray | None = None,
+    ) -> Solution:
+        """Each robot's optimum in environments [x_init; target] (robots, plans, c); see `solve` for the rest."""
         ends = self._ends(system).unpack(environment)
         reference, metric = self._at_rest(system, ends["target"]), self.metric(system)
         size = max(1, _CHUNK // environment.shape[1])
         parts = []
         for first in range(0, len(environment), size):
             some = np.arange(first, min(first + size, len(environment)))
-            problem = Tracking(system.take(some), metric, reference[some], ends["x_init"][some])
+            problem = Tracking((model or system).take(some), metric, reference[some], ends["x_init"][some])
             parts.append(solve(problem, None if start is None else start[some], sweeps=_SWEEPS))
         return Solution(*(np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])))
 
@@ -170,25 +179,16 @@ class Manoeuvre(ManyRobots):
         ranges = np.array([*self.init_range, *self.target_range], dtype=np.float64)
         return rng.uniform(-ranges, ranges, size=(*shape, len(ranges)))
 
-    def _at_rest(self, system: System, target: np.ndarray) -> np.ndarray:
-        """tau that stays at the target (..., p) without inputs, (..., d)."""
-        n, m, T = system.state_dim, system.input_dim, self.horizon
-        lead = target.shape[:-1]
-        states = np.zeros((*lead, T + 1, n))
-        states[..., : target.shape[-1]] = target[..., None, :]
-        return system.layout(T).flatten(states, np.zeros((*lead, T, m)))
+    def _at_rest(self, system: Robots, target: np.ndarray) -> np.ndarray:
+        """tau that stays at the target (*robots, ..., p), (*robots, ..., d); one target (p,) is that of all robots."""
+        T = self.horizon
+        target = target if target.ndim > 1 else np.broadcast_to(target, (*system.robots, 1, len(target)))
+        x, u = at_rest(system, target)
+        return system.layout(T).flatten(np.repeat(x[..., None, :], T + 1, -2), np.repeat(u[..., None, :], T, -2))
 
     def _check_states(self, robots: Robots) -> None:
-        """Raise `ConfigError` unless costs and ranges fit the states, and robots rest at a target without inputs."""
+        """Raise `ConfigError` unless costs and ranges fit the states, and robots rest at a target."""
         for name in ("state_cost", "init_range"):
             if (found := len(getattr(self, name))) != robots.state_dim:
                 raise ConfigError(f"task: {name} has {found} entries, the system {robots.state_dim} states")
-        states, inputs = robots.layout(self.horizon).split(
-            self._at_rest(robots, np.broadcast_to(self.target_range, (*robots.robots, len(self.target_range))))
-        )
-        moved = np.abs(robots.step(states[..., 0, :], inputs[..., 0, :]) - states[..., 0, :]).max()
-        if moved > 1e-9:
-            raise ConfigError(
-                f"task: without inputs a robot moves by {moved:.2g} from a target of {len(self.target_range)} leading "
-                "states; manoeuvre ends at rest, choose a system that rests there"
-            )
+        at_rest(robots, np.broadcast_to(self.target_range, (*robots.robots, len(self.target_range))))
