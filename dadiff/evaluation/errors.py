@@ -23,8 +23,12 @@ def _squared(difference: np.ndarray) -> np.ndarray:
 
 
 def _normalised(difference: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """Root mean square (...) of differences (..., T+1, n), each state over its deviation in all references."""
-    deviation = reference.std(axis=tuple(range(reference.ndim - 1)))
+    """Root mean square (...) of differences (*robots, cases, samples, T+1, n), each state over its deviation.
+
+    Args:
+        reference: whose states deviate, (*robots, cases, T+1, n).
+    """
+    deviation = reference.std(axis=(-3, -2))[..., None, None, None, :]
     with np.errstate(over="ignore", invalid="ignore"):
         return np.sqrt(_squared(difference / np.maximum(deviation, TINY)).mean(axis=-1) / difference.shape[-1])
 
@@ -88,7 +92,7 @@ def tracking_errors(
 ) -> Scores:
     """State and input errors as planned and after replay, the gap between the two, and the dynamics' residual.
 
-    `gap_nrmse` is the gap of a plan, each state over its deviation in all references, as a root mean square.
+    `gap_nrmse` is the gap of a plan, each state over its deviation in the robot's references, as a root mean square.
     """
     x, u = layout.split(planned)
     x_replayed = layout.states(rollout)
