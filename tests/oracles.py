@@ -14,7 +14,7 @@ from dadiff.trajectory import TrajectoryLayout
 def ipopt(
     robot: PlanarQuadrotor, layout: TrajectoryLayout, W: np.ndarray, reference: np.ndarray, x_init: np.ndarray
 ) -> tuple[float, float]:
-    """The least (tau - reference)' W (tau - reference) over the trajectories of one quadrotor from x_init.
+    """The least (tau - reference)' W (tau - reference) over trajectories of a quadrotor within bounds from x_init.
 
     Returns:
         The cost, and the processor seconds of solving, without those of writing the problem out.
@@ -37,6 +37,9 @@ def ipopt(
         k4 = rate(x[:, t] + h * k3, u[:, t])
         problem.subject_to(x[:, t + 1] == x[:, t] + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4))
     problem.subject_to(x[:, 0] == x_init)
+    for values, (low, high) in ((x[:, 1:], robot.bounds.of_states(6)), (u, robot.bounds.of_inputs(2))):
+        for k in np.flatnonzero(np.isfinite(low) | np.isfinite(high)):
+            problem.subject_to(problem.bounded(low[k], values[int(k), :], high[k]))
     states, inputs = layout.split(reference)
     problem.set_initial(x, states.T)
     problem.set_initial(u, inputs.T)

@@ -257,7 +257,8 @@ def test_within_bounds_the_reference_is_the_optimum_among_what_keeps_them(affine
     states, inputs = layout.split(cases.reference)
     np.testing.assert_allclose(np.abs(inputs).max(), largest / 2, rtol=1e-6)
     np.testing.assert_allclose(bounded.simulate(cases.x_init, inputs), states, atol=1e-6 * np.abs(states).max())
-    planned = np.stack([cases.reference, task.solve(bounded, cases.environment)], axis=-2)
+    np.testing.assert_allclose(task.solve(bounded, cases.environment), cases.reference, atol=1e-3 * largest)
+    planned = np.stack([cases.reference, task.solve(affine, cases.environment)], axis=-2)
     scores = task.score(bounded, cases, planned, planned).per_plan
     np.testing.assert_allclose(scores["bounded_cost_ratio"][:, 0], 1, rtol=1e-12)
     assert scores["cost_ratio"].min() >= 1 - 1e-6  # the free optimum costs least
@@ -265,6 +266,32 @@ def test_within_bounds_the_reference_is_the_optimum_among_what_keeps_them(affine
     wide = replace(affine, bounds=Bounds(input_high=1e3 * largest, state_low=-1e6))
     free = task.mean(affine, cases.environment)
     np.testing.assert_allclose(task.mean(wide, cases.environment), free, atol=1e-4 * np.abs(free).max())
+
+
+def test_within_bounds_demonstrations_are_noisy_runs_that_saturate():
+    bounded, task = replace(SYSTEMS["paper"], bounds=Bounds(-2.0, 2.0)), task_for(SYSTEMS["paper"])
+    layout = bounded.layout(task.horizon)
+    shown = task.demonstrations(bounded, 50, numpy_generator(0, "training"))
+    states, inputs = layout.split(shown.trajectories)
+    assert np.abs(inputs).max() == 2.0
+    off = states[:, 1:] - bounded.step(states[:, :-1], inputs)
+    assert off.std() == pytest.approx(bounded.process_noise, rel=0.1)
+    silent = replace(bounded, process_noise=0.0)
+    calm = task.realise(silent, shown.environment, numpy_generator(0, "training"))
+    np.testing.assert_allclose(calm, task.solve(silent, shown.environment), atol=1e-8)
+    stationary = replace(task, expert="stationary").realise(silent, shown.environment, numpy_generator(0, "training"))
+    assert np.abs(layout.inputs(stationary)).max() == 2.0
+
+
+def test_where_no_trajectory_keeps_states_within_bounds_inputs_are_kept():
+    system = replace(SYSTEMS["paper"], bounds=Bounds(-0.1, 0.1, state_high=1.0), process_noise=0.0)
+    ends = np.zeros((2, 8))
+    ends[1, [0, 2]] = 0.9, 1.0  # too fast to be stopped before the bound
+    task = task_for(system)
+    states, inputs = system.layout(task.horizon).split(task.solve(system, ends))
+    assert np.abs(inputs).max() <= 0.1
+    assert (states[0] <= 1).all()
+    assert states[1].max() > 1
 
 
 def test_within_bounds_a_fleet_is_its_robots_one_by_one():

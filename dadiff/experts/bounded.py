@@ -1,9 +1,10 @@
-"""The LQR optimum within bounds on states and inputs: a quadratic program for each case, solved by Clarabel.
+"""The LQR optimum within bounds on states and inputs.
 
     min  sum_{t=0}^{T-1} |x(t) - x_target|_Q^2 + |u(t)|_R^2  +  |x(T) - x_target|_{Q_T}^2
     s.t. x(t+1) = A_t x(t) + B_t u(t) + c_t,    low <= x(t), u(t) <= high
 
-It knows no projection, so that projections can be held against it.
+`optimum_within` solves a quadratic program for each case by Clarabel: references are its, so that projections are held
+against what knows none. `many_within` solves thousands by `dadiff.experts.nearest`, as demonstrations need it.
 """
 
 from __future__ import annotations
@@ -14,7 +15,8 @@ import cvxpy as cp
 import numpy as np
 
 from dadiff.errors import InfeasibleError
-from dadiff.systems import AffineSystem
+from dadiff.experts.nearest import Limits, nearest
+from dadiff.systems import AffineSystem, Bounds
 from dadiff.trajectory.subspace import semidefinite_root
 
 
@@ -25,6 +27,40 @@ class Costs:
     Q: np.ndarray
     R: np.ndarray
     terminal: np.ndarray
+
+
+LEAST = 1e-6
+"""Of the largest weight: what an entry that costs nothing is given, so that it lies somewhere."""
+
+
+def many_within(system: AffineSystem, costs: Costs, horizon: int, x_init: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """The optimum tau (*robots, ..., d) within bounds, up to LEAST; by Clarabel where weights are no diagonals.
+
+    It is the trajectory nearest to rest at the target, as the costs measure it. From where nothing keeps to the bounds
+    on states, those on inputs alone are kept.
+
+    Args:
+        x_init, target: (*robots, ..., n).
+    """
+    if not all(np.array_equal(W, np.diag(np.diag(W))) for W in (costs.Q, costs.R, costs.terminal)):
+        flat = (end.reshape(*system.robots, -1, system.state_dim) for end in (x_init, target))
+        return optimum_within(system, costs, horizon, *flat).reshape(*x_init.shape[:-1], -1)
+    layout, N = system.layout(horizon), x_init[..., 0].size
+    A, B, c = (M.reshape(-1, *M.shape[len(system.robots) :]) for M in system.matrices(horizon))
+    states = np.repeat(np.diag(costs.Q)[None], horizon + 1, axis=0)
+    states[-1] = np.diag(costs.terminal)
+    weight = layout.flatten(states, np.repeat(np.diag(costs.R)[None], horizon, axis=0))
+    scale = np.maximum(weight, LEAST * weight.max()) ** -0.5
+    resting = np.repeat(target.reshape(N, 1, -1), horizon + 1, axis=1)
+    aim = layout.flatten(resting, np.zeros((N, horizon, system.input_dim)))
+    start, places = x_init.reshape(N, -1), np.arange(layout.size)[layout.initial_state]
+    limits = Limits.of(layout, N, system.bounds).pinned(places, start)
+    found = nearest(layout, aim, A, B, c, limits, scale)
+    if not found.found.all():
+        inputs = Bounds(system.bounds.input_low, system.bounds.input_high)
+        other = nearest(layout, aim, A, B, c, Limits.of(layout, N, inputs).pinned(places, start), scale)
+        found.tau[~found.found] = other.tau[~found.found]
+    return found.tau.reshape(*x_init.shape[:-1], -1)
 
 
 def optimum_within(

@@ -15,7 +15,7 @@ from functools import cached_property
 
 import numpy as np
 
-from dadiff.errors import ShapeError
+from dadiff.errors import ConfigError, ShapeError
 from dadiff.experts.ilqr import Metric, Solution
 from dadiff.experts.nearest import Limits, Nearest, nearest
 from dadiff.systems import System
@@ -44,6 +44,26 @@ class LimitedTracking:
     reference: np.ndarray = field(repr=False)
     scale: np.ndarray = field(repr=False)
     limits: Limits = field(repr=False)
+
+    @classmethod
+    def by_bounds(cls, system: System, metric: Metric, reference: np.ndarray, x_init: np.ndarray) -> LimitedTracking:
+        """Within the system's bounds from x_init (*robots, plans, n), by costs that are a diagonal.
+
+        Raises:
+            ConfigError: if the metric is no positive diagonal.
+        """
+        layout = metric.layout
+        weight = metric.times(np.ones(layout.size))
+        Q, R = (np.einsum("tii->ti", W) for W in (metric.Q, metric.R))
+        if not (weight > 0).all() or metric.U.size or not np.allclose(weight, layout.flatten(Q, R)):
+            raise ConfigError(
+                "tracking: within bounds every entry needs a positive weight of its own; give all states a positive "
+                "task.state_cost"
+            )
+        places = np.arange(layout.size)[layout.initial_state]
+        starts = x_init.reshape(-1, layout.state_dim)
+        limits = Limits.of(layout, len(starts), system.bounds).pinned(places, starts)
+        return cls(system, layout, reference, weight**-0.5, limits)
 
     def __post_init__(self) -> None:
         robots, shape = self.system.robots, self.reference.shape

@@ -23,10 +23,13 @@ from dadiff.datasets.generated import PARTS, Dataset
 from dadiff.running import naming
 from dadiff.running.digest import digest
 from dadiff.running.parts import Parts
+from dadiff.systems import Bounds, Family, System
 from dadiff.tasks.encodings import Plain
 from dadiff.tasks.task import Versioned
 
 FORMAT = 2  # raised whenever a change moves results; see CHANGELOG
+
+WITHIN_BOUNDS = 2  # raised whenever a change moves what experts do within a system's bounds, and nothing else
 
 Shared = Literal["demonstrations", "denoiser", "cases"]
 SHARED: tuple[Shared, ...] = get_args(Shared)
@@ -95,6 +98,8 @@ def identity_of(parts: Parts) -> Identity:
     """The identity of a run with these components."""
     given = dict(parts.nodes) | {"recording": _with_noise(parts.nodes["recording"], parts)}
     nodes = {group: _content(getattr(parts, group), node) for group, node in given.items()}
+    if _bounded(parts.system):
+        nodes["task"]["within_bounds"] = WITHIN_BOUNDS
     matters = _groups_that_matter(parts)
     seed, coordinates = parts.settings.seed, parts.settings.coordinates
     expert = {"format": FORMAT, "system": nodes["system"], "task": nodes["task"]}
@@ -114,6 +119,11 @@ def identity_of(parts: Parts) -> Identity:
         denoiser if parts.denoiser.trainable else None,
         recording if "recording" in matters else None,
     )
+
+
+def _bounded(system: System | Family[Any]) -> bool:
+    bounds = system.bounds if isinstance(system, System) else getattr(system, "bounds", None)
+    return bounds.any if isinstance(bounds, Bounds) else Bounds.of(bounds).any
 
 
 def _groups_that_matter(parts: Parts) -> list[str]:

@@ -55,8 +55,8 @@ class LQR:
         reference: a test case's reference is the controller's trajectory without process noise (`mean`), or
             one noisy run of it (`realised`).
 
-    Where the system has bounds, the mean reference is the optimum within them. The controller, whose runs are the
-    demonstrations and `solve`, knows none.
+    Where the system has bounds, references and `solve` are the optimum within them, and demonstrations are its noisy
+    runs: the controller tracks it, and its inputs saturate. Noise may take states out of theirs. `law` knows no bounds.
     """
 
     version: ClassVar[str] = "lqr-v1"
@@ -182,6 +182,8 @@ class LQR:
 
     def realise(self, system: AffineSystem, environment: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """One noisy run of the expert for each E (*robots, ..., 2n): tau of shape (*robots, ..., d)."""
+        if system.bounds.any:
+            return self._realise_within(system, environment, rng)
         law = self.law(system)
         noise = rng.standard_normal((*environment.shape[:-1], law.noise_map.shape[-1]))
         return law.mean(environment) + along(law.noise_map, noise)
@@ -200,8 +202,34 @@ class LQR:
             start: of no use to a closed form.
         """
         cost, ends, model = self.cost(system), self.condition(system).unpack(environment), model or system
-        feedback = optimal_feedback(model, cost.Q, cost.R, self.horizon, cost.terminal)
-        return follow(model, feedback, ends["x_init"], ends["target"])
+        if system.bounds.any:
+            from dadiff.experts.bounded import Costs, many_within
+
+            model = replace(model, bounds=system.bounds)
+            return many_within(model, Costs(cost.Q, cost.R, cost.terminal), self.horizon, **ends)
+        return self._free_optimum(model, environment)
+
+    def _free_optimum(self, system: AffineSystem, environment: np.ndarray) -> np.ndarray:
+        """The optimum without bounds."""
+        cost, ends = self.cost(system), ends_layout(system).unpack(environment)
+        feedback = optimal_feedback(system, cost.Q, cost.R, self.horizon, cost.terminal)
+        return follow(system, feedback, ends["x_init"], ends["target"])
+
+    def _realise_within(self, system: AffineSystem, environment: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Runs of u(t) = clip(u*(t) + K(t) (x(t) - x*(t))) about the optimum within bounds, or of clipped feedback."""
+        feedback, layout, T = self.feedback(system), system.layout(self.horizon), self.horizon
+        ends, low_high = ends_layout(system).unpack(environment), system.bounds.of_inputs(system.input_dim)
+        noise, x = system.noise((*environment.shape[:-1], T), rng), [ends["x_init"]]
+        plan = layout.split(self.solve(system, environment)) if self.expert == "optimal" else None
+        inputs: list[np.ndarray] = []
+        for t in range(T):
+            if plan is None:
+                wanted = feedback.at(t, x[-1], ends["target"])
+            else:
+                wanted = plan[1][..., t, :] + along(feedback.K[..., t, :, :], x[-1] - plan[0][..., t, :])
+            inputs.append(np.clip(wanted, *low_high))
+            x.append(system.step(x[-1], inputs[-1], t) + noise[..., t, :])
+        return layout.flatten(np.stack(x, axis=-2), np.stack(inputs, axis=-2))
 
     def goal(self, system: AffineSystem, environment: np.ndarray) -> np.ndarray:
         """The target (*robots, ..., n)."""
@@ -217,7 +245,7 @@ class LQR:
         Where the system has bounds that optimum may exceed them, and `bounded_cost_ratio` is over the optimum within.
         """
         cost, target, layout = self.cost(system), cases.get("target"), system.layout(self.horizon)
-        optimum = self.solve(system, ends_layout(system).pack(x_init=cases.x_init, target=target))
+        optimum = self._free_optimum(system, ends_layout(system).pack(x_init=cases.x_init, target=target))
         spent = cost(*layout.split(rollout), target[..., None, :])
         against = {"cost_ratio": optimum}
         if system.bounds.any and self.reference == "mean":

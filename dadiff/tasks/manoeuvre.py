@@ -4,7 +4,7 @@
 
 Each robot rests at the target in its own way, f(x_rest, u_rest) = x_rest. As in the fleet the network sees trajectories
 of all training robots and is told start and target, not the robot. The expert is iterated LQR, each robot solved by its
-own.
+own, within the system's bounds where it has some.
 """
 
 from __future__ import annotations
@@ -16,7 +16,9 @@ from typing import ClassVar
 import numpy as np
 
 from dadiff.errors import ConfigError
+from dadiff.experts import limited_ilqr
 from dadiff.experts.ilqr import Metric, Solution, Tracking, solve
+from dadiff.experts.limited_ilqr import LimitedTracking
 from dadiff.systems import Family, Robots, System
 from dadiff.systems.rest import at_rest
 from dadiff.tasks.robots import ManyRobots, joined, scores_of
@@ -167,8 +169,13 @@ class Manoeuvre(ManyRobots):
         parts = []
         for first in range(0, len(environment), size):
             some = np.arange(first, min(first + size, len(environment)))
-            problem = Tracking((model or system).take(some), metric, reference[some], ends["x_init"][some])
-            parts.append(solve(problem, None if start is None else start[some], sweeps=_SWEEPS))
+            taken = system if model is None else replace(model, bounds=system.bounds)
+            given = taken.take(some), metric, reference[some], ends["x_init"][some]
+            begin = None if start is None else start[some]
+            if system.bounds.any:
+                parts.append(limited_ilqr.solve(LimitedTracking.by_bounds(*given), begin, sweeps=_SWEEPS))
+            else:
+                parts.append(solve(Tracking(*given), begin, sweeps=_SWEEPS))
         return Solution(*(np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])))
 
     def _ends(self, system: System) -> Layout:
