@@ -13,6 +13,7 @@ from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
+from dadiff import manual
 from dadiff.commands import reported
 from dadiff.config.composed import plain
 from dadiff.config.trust import trust
@@ -72,7 +73,10 @@ def main() -> None:
     """Entry point."""
     settle()
     sys.argv[1:] = overrides_first(sys.argv[1:])
-    trust(components_named(get_args_parser().parse_args(sys.argv[1:]).overrides))
+    given = get_args_parser().parse_args(sys.argv[1:])
+    if given.help:
+        raise SystemExit(reported("dadiff", lambda: print(manual.text(given.config_dir))))
+    trust(components_named(given.overrides))
     raise SystemExit(
         reported("dadiff", lambda: check_what_is_printed(sys.argv[1:])) or reported("dadiff", _application)
     )

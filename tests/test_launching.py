@@ -14,10 +14,10 @@ from pathlib import Path
 import pytest
 
 from dadiff.errors import ConfigError, DataError
-from dadiff.launching.outcome import why
+from dadiff.launching.outcome import Outcome, why
 from dadiff.launching.process_pool import ProcessPool
-from dadiff.launching.table import Table, clock, last_line
-from dadiff.launching.work import Work
+from dadiff.launching.table import Table, clock, last_line, progress_of, shortened, time_left
+from dadiff.launching.work import Running, Work
 from dadiff.threads import cores
 
 
@@ -212,14 +212,43 @@ class Terminal(io.StringIO):
 @pytest.mark.parametrize("stream", [io.StringIO(), Terminal()])
 def test_the_table_shows_what_runs_and_keeps_what_ended(stream, pool, tmp_path, monkeypatch):
     monkeypatch.setattr("dadiff.launching.table.REDRAW_SECONDS", 0.0)
-    table = Table(stream, total=2, skipped=3)
-    pool.run([work(tmp_path, "a", write, tmp_path / "o", "x", 0.6), work(tmp_path, "b", fail, "error")], table)
+    works = [work(tmp_path, "a", write, tmp_path / "o", "x", 0.6), work(tmp_path, "b", fail, "error")]
+    table = Table(stream, works, skipped=3)
+    pool.run(works, table)
     table.close()
     shown = stream.getvalue()
     assert "[2/2]" in shown
     assert "row 3 is nan" in shown
     assert ("1 running" in shown) == stream.isatty()
     assert ("\x1b[" in shown) == stream.isatty()
+
+
+def test_a_live_row_keeps_what_differs_and_the_progress_at_80_columns(tmp_path, monkeypatch):
+    monkeypatch.setattr("dadiff.launching.table.REDRAW_SECONDS", 0.0)
+    monkeypatch.setenv("COLUMNS", "80")
+    names = {
+        key: f"lqr/{kind}/S=100/w=0.01/normalised/{'mlp' * 20}/seed=0"
+        for key, kind in zip("ab", ("known", "none"), strict=True)
+    }
+    works = [replace(work(tmp_path, key, write), name=name) for key, name in names.items()]
+    works[0].log_file.parent.mkdir(parents=True, exist_ok=True)
+    works[0].log_file.write_text("sampling:  42%|####      | 42/100 [00:05<00:07,  8.2it/s]")
+    stream = Terminal()
+    table = Table(stream, works, skipped=0)
+    table.ended(works[1], Outcome("finished", None, 60.0))
+    table.tick([Running(works[0])])
+    *_, summary, row = stream.getvalue().splitlines()
+    assert row.split(maxsplit=2)[2] == "known  sampling 42 %, 00:07 left"
+    assert "1 done, 1 running" in summary
+    assert summary.endswith("about 1:00 left") or summary.endswith("about 60.0 s left")
+    assert max(map(len, stream.getvalue().splitlines())) < 80
+
+
+def test_the_time_left_is_that_of_what_runs_and_waits_at_the_pace_of_what_ended():
+    assert time_left([], [1.0], 5) is None
+    assert time_left([10.0, 30.0], [5.0, 5.0], waiting=4) == (15 + 15 + 4 * 20) / 2
+    assert shortened("a" * 30 + "b" * 30, 21) == "a" * 10 + "…" + "b" * 10
+    assert progress_of("loading the data") == "loading the data"
 
 
 def test_the_last_line_of_a_log_is_its_progress(tmp_path):

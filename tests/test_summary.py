@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from dadiff.running.summary import MOST_ROWS, differences, one_run, several_runs
+from dadiff.running.summary import MOST_ROWS, one_run, several_runs
 from dadiff.store import Record, StoredRun
+from dadiff.store.names import differences
 
 
 def run(name: str, cost: float | None, status: str = "finished") -> StoredRun:
@@ -43,6 +44,14 @@ def test_the_table_fits_the_terminal(width, monkeypatch):
     runs = [run(f"lqr/{'long' * 20}_{kind}/seed=0", 1.0) for kind in ("known", "none")]
     assert max(map(len, several_runs(runs).splitlines())) <= width
     assert "known" in several_runs(runs)
+
+
+def test_a_narrow_terminal_shows_fewer_numbers_and_whole_words(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "60")
+    runs = [run(f"lqr/{kind}/dpm_solver(num_steps=5)/seed=0", 1.0) for kind in ("hankel_lowrank", "none")]
+    head, first, *_ = several_runs(runs).splitlines()
+    assert head.split() == ["run", "cost", "ratio", "state", "error"]
+    assert first.startswith("hankel_lowrank")
 
 
 def test_names_keep_at_least_one_word():

@@ -154,6 +154,36 @@ def test_what_a_killed_process_left_running_goes_with_the_next_catching_up(track
     assert [mirror.info.status for mirror in runs(tracking)] == ["FINISHED"]
 
 
+def test_a_run_shows_its_plans_and_the_data_that_it_was_made_with(tracking, tmp_path):
+    record = Record(KEY, "lqr/known/seed=1", "finished", links={"demonstrations": "d" * 16, "cases": "c" * 16})
+    states = np.random.default_rng(0).standard_normal((2, 3, 11, 4))
+    tracking.log_run(Results(tmp_path).write(record, arrays={"states": states, "reference_states": states[:, 0]}))
+    (mirror,) = runs(tracking)
+    images = open_client(tracking.uri).list_artifacts(mirror.info.run_id, "images")
+    assert {Path(image.path).suffix for image in images} == {".png", ".webp"}
+    assert all(Path(image.path).name.startswith("plans") for image in images)
+    used = {data.dataset.name: data.tags[0].value for data in mirror.inputs.dataset_inputs}
+    assert used == {"demonstrations/dddddddd": "training", "cases/cccccccc": "testing"}
+
+
+def test_a_training_is_a_model_with_a_planner_that_loads(tracking, tmp_path, monkeypatch):
+    import dadiff
+
+    monkeypatch.chdir(tmp_path)
+    small = ["dataset.train_size=20", "dataset.test_size=2", "training.steps=2", "training.warmup=0"]
+    run = dadiff.run([*small, "projector=known_fixed", "tracking.enabled=false", "progress=false"])
+    for _ in range(2):
+        tracking.catch_up(tmp_path / "outputs", [run])
+    client = open_client(tracking.uri)
+    (model,) = client.search_logged_models([tracking._experiment_id])
+    assert model.tags["denoiser"] == run.record.links["denoiser"]
+    assert model.source_run_id == runs(tracking, "tags.kind = 'run'")[0].info.run_id
+    (file,) = Path(model.artifact_location.removeprefix("file://")).glob("planner.zip")
+    before, after = dadiff.Planner.load(run.folder), dadiff.Planner.load(file)
+    given = {"x_init": [0, 0, 0, 0], "target": [1, 2, 0, 0], "seed": 0}
+    np.testing.assert_array_equal(before.plan(**given).states, after.plan(**given).states)
+
+
 def sweep_of(*cells: Cell, seeds: str = "1") -> Sweep:
     return Sweep("quick", "dadiff +sweeps=quick", {"seed": seeds}, list(cells))
 
@@ -173,6 +203,31 @@ def test_a_sweep_is_one_parent_however_often_it_is_run(tracking, tmp_path):
     assert parent.data.tags["cells"] == "1 failed, 1 finished"
     (mirror,) = runs(tracking, f"tags.`mlflow.parentRunId` = '{parents[0]}'")
     assert mirror.info.run_name == run.name
+
+
+def test_a_sweep_opens_as_a_table_with_what_varies_in_front_and_charts_on_log_axes(tracking, tmp_path):
+    axes = {"projector": "known", "seed": 1}
+    names = {KEY: "lqr/known/mlp/seed=1", "f" * 16: "lqr/none/mlp/seed=1"}
+    cells = [Cell(key, name, axes | {"projector": name.split("/")[1]}) for key, name in names.items()]
+    Sweeps(tmp_path).write(sweep_of(*cells))
+    tracking.catch_up(tmp_path, [store(tmp_path)], ["quick"])
+    (mirror,) = runs(tracking, "tags.kind = 'run'")
+    assert mirror.info.run_name == "known · lqr/mlp/seed=1"
+    client = open_client(tracking.uri)
+    state = json.loads(client.get_experiment(tracking._experiment_id).tags["mlflow.sharedViewState.quick"])
+    assert state["selectedColumns"][-1] == "params.`projector`"
+    assert state["orderByKey"] == state["selectedColumns"][0] == min(state["selectedColumns"])
+    assert [chart["scaleType"] for chart in state["compareRunCharts"] if chart["type"] == "LINE"] == ["log"] * 3
+    assert "workflowType=machine_learning&viewStateShareKey=quick" in tracking.how_to_look("quick")
+
+
+def test_the_note_of_a_sweep_says_what_its_report_found(tracking, tmp_path):
+    Sweeps(tmp_path).write(sweep_of(Cell(KEY, "a")))
+    (tmp_path / "reports" / "quick").mkdir(parents=True)
+    (tmp_path / "reports" / "quick" / "report.json").write_text('{"format": 2, "sentences": ["Helps: it does."]}')
+    tracking.log_sweep(tmp_path, "quick")
+    (mirror,) = runs(tracking, "tags.kind = 'sweep'")
+    assert mirror.data.tags["mlflow.note.content"].startswith("- Helps: it does.")
 
 
 def test_a_sweep_that_was_extended_shows_what_it_is_now(tracking, tmp_path):

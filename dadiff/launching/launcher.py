@@ -91,7 +91,7 @@ class SweepLauncher(Launcher):
         pool = self.pool(run, lease) if run.plan.waiting else None
         parent = run.open()
         works = run.works()
-        watch = Watch(run, parent, Table(sys.stderr, len(works), skipped))
+        watch = Watch(run, parent, Table(sys.stderr, works, skipped))
         interrupted = False
         if skipped:
             sys.stderr.write(_said_of_done(skipped, len(run.plan.cells)))

@@ -9,6 +9,7 @@ import shlex
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 from dadiff.launching import jobs
@@ -20,6 +21,7 @@ from dadiff.store import DONE, Cell, Results, StoredRun, Sweep, Sweeps
 from dadiff.tracking import Tracking
 from dadiff.tracking.client import spared
 from dadiff.tracking.content import results_table
+from dadiff.tracking.views import short_names
 
 
 @dataclass(frozen=True)
@@ -87,7 +89,12 @@ class SweepRun:
         if any(preparation.artefact.key == key for preparation in self.plan.preparations):
             self.tracking.log_training(self.output_dir, key)
         elif (results := Results(self.output_dir)).status(key) is not None:
-            self.tracking.log_run(results.read(key), parent)
+            self.tracking.log_run(results.read(key), parent, self._names[key])
+
+    @cached_property
+    def _names(self) -> dict[str, str]:
+        """Key of a run -> what its sweep calls it in MLflow."""
+        return short_names(self.record([cell.cell() for cell in self.plan.cells]))
 
     def close(self, outcomes: Mapping[str, Outcome], *, interrupted: bool) -> Sweep:
         """Bring the sweep's record, its table and MLflow up to date. Returns the record."""

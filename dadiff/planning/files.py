@@ -2,14 +2,12 @@
 
 A run's folder holds the same two, without the weights, which lie in the store's cache. The zip holds the weights, the
 robot's set and coordinates, and needs neither demonstrations nor the folder that it was trained in. Loading it executes
-nothing: see `dadiff.planning.codec`. Entries are stored, not compressed, so that no file unpacks to more than its size.
+nothing: see `dadiff.planning.codec`; the files as such: `dadiff.store.planners`.
 """
 
 from __future__ import annotations
 
 import json
-import re
-import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
@@ -17,8 +15,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from safetensors import SafetensorError
-from safetensors.numpy import load as read_arrays
 from safetensors.numpy import save as write_arrays
 
 from dadiff import __version__
@@ -26,11 +22,9 @@ from dadiff.denoisers.checkpoints import fill
 from dadiff.errors import CheckpointError
 from dadiff.planning.codec import Decoder, Encoder
 from dadiff.planning.planner import Parts, Planner
-from dadiff.store import Cache
+from dadiff.store.planners import ARRAYS, DESCRIPTION, WEIGHTS, read_file, read_folder, write_file
 
 FORMAT = 1
-DESCRIPTION, ARRAYS, MODEL = "planner.json", "arrays.safetensors", "model.safetensors"
-WEIGHTS = "weights."
 RUNTIME = ("denoiser", "device")  # fields of a planner that are stored by other means, or not
 
 
@@ -42,15 +36,7 @@ def save(planner: Planner, path: Path) -> Path:
     """
     description, arrays = described(planner)
     arrays |= {WEIGHTS + name: tensor.detach().cpu().numpy() for name, tensor in planner.denoiser.state_dict().items()}
-    partial = path.with_name(f".{path.name}.partial")
-    try:
-        with zipfile.ZipFile(partial, "w", zipfile.ZIP_STORED) as file:
-            file.writestr(DESCRIPTION, json.dumps(description))
-            file.writestr(ARRAYS, write_arrays(arrays))
-        partial.replace(path)
-    except OSError as error:
-        raise CheckpointError(f"{path}: cannot be written ({error.strerror}); name another place") from error
-    return path
+    return write_file(path, description, arrays)
 
 
 def described(planner: Planner) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -83,7 +69,7 @@ def load(path: Path, components: Sequence[str] = (), device: str = "cpu") -> Pla
     Raises:
         CheckpointError: if the file is missing, foreign, damaged, too large, or of a newer version.
     """
-    description, arrays = _folder(path) if path.is_dir() else _opened(path)
+    description, arrays = read_folder(path) if path.is_dir() else read_file(path)
     return planner_of(description, arrays, str(path), components, device)
 
 
@@ -132,54 +118,3 @@ def _check_format(description: Mapping[str, Any], where: str) -> None:
             f"{where}: has format {found}, this version reads up to {FORMAT}; update dadiff ({__version__} is here, "
             f"{description.get('dadiff', 'unknown')} wrote it)"
         )
-
-
-def _folder(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """What a run's folder holds, and the weights from the cache beside it."""
-    if not (path / DESCRIPTION).is_file():
-        raise CheckpointError(
-            f"{path}: holds no {DESCRIPTION}; it is no run of a plan that can be loaded, or an old one"
-        )
-    try:
-        description = json.loads((path / DESCRIPTION).read_bytes())
-        if reason := description.get("unavailable"):
-            raise CheckpointError(f"{path}: cannot be loaded as a planner: {str(reason)[:300]}")
-        arrays = read_arrays((path / ARRAYS).read_bytes())
-        if (key := description.get("weights")) is None:
-            return description, arrays
-        return description, arrays | {WEIGHTS + name: a for name, a in _model(path, key).items()}
-    except (json.JSONDecodeError, UnicodeDecodeError, SafetensorError, AttributeError, OSError) as error:
-        raise CheckpointError(
-            f"{path}: the planner in it is damaged ({error}); run it again with force=true"
-        ) from error
-
-
-def _model(path: Path, key: object) -> dict[str, np.ndarray]:
-    if not (isinstance(key, str) and re.fullmatch("[0-9a-f]{16}", key)):
-        raise CheckpointError(f"{path}: names the weights {str(key)[:40]!r}, which is no key of a cache")
-    file = Cache(path.absolute().parent.parent).folder("denoiser", key) / MODEL
-    if not file.is_file():
-        raise CheckpointError(f"{path}: its trained denoiser {key} is no longer in the cache; run it again")
-    return read_arrays(file.read_bytes())
-
-
-def _opened(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    if not path.is_file():
-        raise CheckpointError(f"{path}: no such file; give a file that planner.save(...) wrote, or a run's folder")
-    try:
-        with zipfile.ZipFile(path) as file:
-            _check_entries(file, path)
-            return json.loads(file.read(DESCRIPTION)), read_arrays(file.read(ARRAYS))
-    except (zipfile.BadZipFile, json.JSONDecodeError, UnicodeDecodeError, SafetensorError, KeyError, OSError,
-            RecursionError) as error:  # fmt: skip
-        raise CheckpointError(f"{path}: is no planner of dadiff, or damaged ({error})") from error
-
-
-def _check_entries(file: zipfile.ZipFile, path: Path) -> None:
-    names = {entry.filename for entry in file.infolist()}
-    if names != {DESCRIPTION, ARRAYS}:
-        raise CheckpointError(f"{path}: holds {', '.join(sorted(names))[:80]}; expected {DESCRIPTION} and {ARRAYS}")
-    if any(entry.compress_type != zipfile.ZIP_STORED for entry in file.infolist()):
-        raise CheckpointError(f"{path}: is compressed, which a planner's file never is; save it again")
-    if sum(entry.file_size for entry in file.infolist()) > path.stat().st_size:
-        raise CheckpointError(f"{path}: declares more bytes than it has; it is damaged")

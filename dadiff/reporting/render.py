@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from dadiff.errors import StoreError
-from dadiff.reporting import configurations, published, publishing
+from dadiff.reporting import configurations, published, publishing, story
 from dadiff.reporting.claims import read_ledger
 from dadiff.reporting.definitions import FOLDER
 from dadiff.reporting.latex import to_latex
@@ -125,7 +125,8 @@ def numbers(report: Report) -> dict[str, Any]:
         "tables": {part.item.id: _part(part) for part in report.tables},
         "figures": {part.item.id: _part(part) for part in report.figures},
     }
-    return strict(content)
+    said: dict[str, Any] = strict(content)
+    return {**said, "sentences": story.sentences(said, story.ledger(said, []))}
 
 
 def to_json(content: dict[str, Any]) -> str:

@@ -19,7 +19,7 @@ import pandas as pd
 from dadiff.errors import StoreError
 from dadiff.store import Record, Results, StoredRun, Sweeps
 from dadiff.store.results import read_table
-from dadiff.tracking.links import pages
+from dadiff.tracking.links import pages, table
 
 
 @lru_cache(maxsize=64)
@@ -135,11 +135,16 @@ class Cell:
 
 @dataclass(frozen=True)
 class Sweep:
-    """Cells that were asked for together, and the command that asks for them again."""
+    """Cells that were asked for together, and the command that asks for them again.
+
+    Args:
+        tables: name of a sweep -> its table of runs in MLflow's pages.
+    """
 
     name: str
     command: str
     cells: list[Cell]
+    tables: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def finished(self) -> list[Cell]:
@@ -164,7 +169,9 @@ def read_sweeps(output_dir: Path, names: list[str]) -> Sweep:
     """
     sweeps = [_read(output_dir, name) for name in names]
     commands = dict.fromkeys(sweep.command for sweep in sweeps if sweep.command)
-    return Sweep("+".join(names), " && ".join(commands), [cell for sweep in sweeps for cell in sweep.cells])
+    cells = [cell for sweep in sweeps for cell in sweep.cells]
+    tables = {name: page for name in names if (page := table(output_dir, name))}
+    return Sweep("+".join(names), " && ".join(commands), cells, tables)
 
 
 def _read(output_dir: Path, name: str) -> Sweep:

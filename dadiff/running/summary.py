@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+import shutil
 from collections.abc import Sequence
 
 from rich.table import Table
 
 from dadiff.store import StoredRun
+from dadiff.store.names import differences
 from dadiff.terminal import plain_table, text
 
 METRICS = {
@@ -25,6 +27,7 @@ METRICS = {
 COLUMNS = ("cost ratio", "state error", "replayed", "plan-replay gap", "seconds")
 """Of several runs, which are sorted by the first of these that they have."""
 MOST_ROWS = 30
+NAME_WIDTH, NUMBER_WIDTH, GAP = 34, 9, 2
 
 
 def one_run(run: StoredRun) -> str:
@@ -42,7 +45,7 @@ def several_runs(runs: Sequence[StoredRun]) -> str:
     """One row a run, called by what is not the same in all of them; runs without numbers come last."""
     if not runs:
         return ""
-    titles = [title for title in COLUMNS if any(METRICS[title] in run.metrics for run in runs)]
+    titles = _fitting([title for title in COLUMNS if any(METRICS[title] in run.metrics for run in runs)])
     table = plain_table("run", *titles)
     for column in table.columns[1:]:
         column.justify = "right"
@@ -50,21 +53,20 @@ def several_runs(runs: Sequence[StoredRun]) -> str:
     ranked = sorted(zip(runs, names, strict=True), key=lambda entry: _rank(entry[0]))
     for run, name in ranked[:MOST_ROWS]:
         numbers = [_number(run.metrics.get(METRICS[title])) for title in titles]
-        table.add_row(name, *(numbers if run.status == "finished" else [run.status][: len(titles)]))
+        table.add_row(name.replace("/", " "), *(numbers if run.status == "finished" else [run.status][: len(titles)]))
     more = len(ranked) - MOST_ROWS
     return text(table) + (f"\n... and {more} more" if more > 0 else "")
 
 
-def differences(names: Sequence[str]) -> list[str]:
-    """Each name without the words that all of them have.
-
-    Example:
-        >>> differences(["lqr/known/mlp/seed=0", "lqr/none/mlp/seed=0"])
-        ['known', 'none']
-    """
-    words = [name.split("/") for name in names]
-    common = set.intersection(*map(set, words))
-    return ["/".join(word for word in name if word not in common) or "/".join(name) for name in words]
+def _fitting(titles: Sequence[str]) -> list[str]:
+    """The titles that leave a name the room it needs, the first in any case."""
+    left, kept = shutil.get_terminal_size().columns - NAME_WIDTH, list[str]()
+    for title in titles:
+        width = max(len(title), NUMBER_WIDTH) + GAP
+        if width <= left or not kept:
+            kept.append(title)
+            left -= width
+    return kept
 
 
 def _rank(run: StoredRun) -> tuple[bool, float]:

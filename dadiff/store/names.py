@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import PurePosixPath
 
 from dadiff.errors import StoreError
@@ -59,3 +60,15 @@ def _formed(text: object, form: re.Pattern[str], what: str, expected: str) -> st
     if not isinstance(text, str) or not form.fullmatch(text):
         raise StoreError(f"{str(text)[:80]!r} is no {what}; expected {expected}")
     return text
+
+
+def differences(names: Sequence[str]) -> list[str]:
+    """Each name without the words that all of them have.
+
+    Example:
+        >>> differences(["lqr/known/mlp/seed=0", "lqr/none/mlp/seed=0"])
+        ['known', 'none']
+    """
+    words = [name.split("/") for name in names]
+    common = set.intersection(*map(set, words))
+    return ["/".join(word for word in name if word not in common) or "/".join(name) for name in words]

@@ -18,18 +18,13 @@ from dadiff.store import DONE, Cache, Results, StoredRun, Sweep, Sweeps
 from dadiff.store.cache import MANIFEST
 from dadiff.store.files import checksum, read_json
 from dadiff.store.results import RECORD
+from dadiff.tracking import pictures
+from dadiff.tracking.views import PLANS
 
 if TYPE_CHECKING:
+    import numpy as np
     import pandas as pd
 
-HEADLINE = (
-    "rollout_state_error",
-    "planned_state_error",
-    "planned_input_error",
-    "cost_ratio",
-    "dynamics_residual",
-    "sampling_seconds",
-)
 INDICES = ("robot", "case", "sample", "t", "step")
 OVER_TIME = "t/"
 ARTIFACTS = (".json", ".yaml", ".parquet", ".csv", ".png", ".svg", ".pdf")
@@ -39,12 +34,24 @@ MLFLOW_STATUS = {"killed": "KILLED", "interrupted": "KILLED"}
 
 
 @dataclass(frozen=True)
+class Data:
+    """A data set in the cache: its name and key, what it is used for, and where it lies."""
+
+    name: str
+    digest: str
+    context: str
+    source: str
+
+
+@dataclass(frozen=True)
 class Content:
     """What is logged of one run.
 
     Args:
         metrics: (name, value, step), finite values only.
         files: folder among the artifacts ("" is their top) -> files.
+        inputs: the data sets that it was made with.
+        images: key -> picture (height, width, 3).
         started, time: of the work and of all metrics, in ms since 1970; from the record, so that logging again
             changes nothing; None and 0 where that is not recorded.
     """
@@ -53,6 +60,8 @@ class Content:
     metrics: list[tuple[str, float, int]] = field(default_factory=list)
     tags: dict[str, str] = field(default_factory=dict)
     files: dict[str, list[Path]] = field(default_factory=dict)
+    inputs: list[Data] = field(default_factory=list)
+    images: dict[str, np.ndarray] = field(default_factory=dict)
     started: int | None = None
     time: int = 0
 
@@ -77,10 +86,10 @@ class Piece:
     read: Callable[[], Content] = field(repr=False, compare=False)
 
 
-def run_piece(run: StoredRun) -> Piece:
-    """A stored run, whether it is a result or failed."""
+def run_piece(run: StoredRun, name: str | None = None) -> Piece:
+    """A stored run, whether it is a result or failed, under its own name or that which its sweep gives it."""
     status = "FINISHED" if run.record.is_done else MLFLOW_STATUS.get(run.status, "FAILED")
-    return Piece("run", run.key, run.name, _stamp(run.folder / RECORD), status, partial(run_content, run))
+    return Piece("run", run.key, name or run.name, _stamp(run.folder / RECORD), status, partial(run_content, run))
 
 
 def training_piece(output_dir: Path | str, key: str) -> Piece | None:
@@ -129,9 +138,25 @@ def run_content(run: StoredRun) -> Content:
         "mlflow.note.content": run_note(run),
     }
     params = {name: _text(value) for name, value in run.axes.items()}
+    picture = pictures.plans(run)
     return Content(
-        params, scalars(run) + curves(run), tags, {"": artifacts(run.folder)}, *times(made.started, made.seconds)
-    )
+        params, scalars(run) + curves(run), tags, {"": artifacts(run.folder)}, data(run),
+        {} if picture is None else {PLANS: picture}, *times(made.started, made.seconds),
+    )  # fmt: skip
+
+
+CONTEXTS = {"demonstrations": "training", "cases": "testing"}
+"""Kinds of data sets, and what MLflow calls their use."""
+
+
+def data(run: StoredRun) -> list[Data]:
+    """The data sets that a run was made with."""
+    cache = Cache(run.folder.parent.parent)
+    return [
+        Data(f"{kind}/{key[:8]}", key, CONTEXTS[kind], str(cache.folder(kind, key)))
+        for kind, key in run.record.links.items()
+        if kind in CONTEXTS
+    ]
 
 
 def scalars(run: StoredRun) -> list[tuple[str, float, int]]:
@@ -183,7 +208,8 @@ def training_content(folder: Path) -> Content:
     note = f"Training of the denoiser `{manifest['key']}`, shared by every run whose tag `link.denoiser` names it."
     tags = {"status": "finished", "mlflow.note.content": f"{note}\n\nThe weights lie in `{folder}`."}
     params = {name: _text(value) for name, value in identity.items()}
-    return Content(params, metrics, tags, {"": artifacts(folder)}, *times(manifest.get("created")))
+    began, ended = times(manifest.get("created"))
+    return Content(params, metrics, tags, {"": artifacts(folder)}, started=began, time=ended)
 
 
 def sweep_content(output_dir: Path | str, name: str) -> Content:
@@ -195,10 +221,11 @@ def sweep_content(output_dir: Path | str, name: str) -> Content:
     counts = Counter(cell.status for cell in sweep.cells)
     failed = [f"- {cell.name}: {cell.status}, {cell.reason}" for cell in sweep.cells if cell.reason]
     note = [
-        f"**{sweep.name}**: {len(sweep.cells)} cells. Run or resume it with",
+        *(f"- {sentence}" for sentence in _found(output_dir, name)),
+        f"**{sweep.name}**: {len(sweep.cells)} runs. Run or resume it with",
         f"```\n{sweep.command}\n```",
         *(["\n".join(["| over | values |", "|---|---|", *_rows(sweep.definition)])] if sweep.definition else []),
-        "`results.csv` among the artifacts has one row a cell.",
+        "`results.csv` among the artifacts has one row a run; the report is among them once it was logged.",
         *(["Not finished:\n" + "\n".join(failed)] if failed else []),
     ]
     tags = {
@@ -213,34 +240,14 @@ def sweep_content(output_dir: Path | str, name: str) -> Content:
     return Content(tags=tags, files=files)
 
 
-def sweep_view(sweep: Sweep, parent: str) -> str:
-    """State of MLflow's runs page that shows a sweep: its runs, with what varies and the headline metrics as columns.
-
-    MLflow keeps such states as tags of the experiment, and opens one with `?viewStateShareKey=` in the address.
-    """
-    columns = [f"params.`{name}`" for name in varying(sweep)] + [f"metrics.`{name}`" for name in HEADLINE]
-    return json.dumps(
-        {
-            "searchFilter": f"tags.`mlflow.parentRunId` = '{parent}'",
-            "orderByKey": f"metrics.`{HEADLINE[0]}`",
-            "orderByAsc": True,
-            "selectedColumns": columns,
-        }
-    )
-
-
-def varying(sweep: Sweep) -> list[str]:
-    """The axes that differ between cells; of several that always move together (the seeds) the first."""
-    values: dict[tuple[str, ...], str] = {}
-    for name in dict.fromkeys(name for cell in sweep.cells for name in cell.axes):
-        column = tuple(_text(cell.axes.get(name)) for cell in sweep.cells)
-        if len(set(column)) > 1:
-            values.setdefault(column, name)
-    return list(values.values())
+def _found(output_dir: Path | str, name: str) -> list[str]:
+    """The sentences of the sweep's report, if there is one."""
+    path = Path(output_dir) / "reports" / name / "report.json"
+    return [str(sentence) for sentence in json.loads(path.read_text()).get("sentences", [])] if path.is_file() else []
 
 
 def results_table(sweep: Sweep, results: Results) -> pd.DataFrame:
-    """One row a cell: name, status, axes, headline metrics, key."""
+    """One row a run: name, status, axes, headline metrics, key."""
     import pandas as pd
 
     rows = []

@@ -12,6 +12,7 @@ from typing import Any
 from urllib.parse import quote
 
 from dadiff.tracking.content import Piece
+from dadiff.tracking.views import STATE, run_page, table_page
 
 LOCAL_UI = "http://127.0.0.1:5000"
 """Where `mlflow ui` answers."""
@@ -29,6 +30,7 @@ RUNS = """
 SELECT tags.value, runs.experiment_id, runs.run_uuid FROM runs JOIN tags ON tags.run_uuid = runs.run_uuid
 WHERE tags.key = 'key' AND runs.lifecycle_stage = 'active'
 """
+TABLES = "SELECT experiment_id FROM experiment_tags WHERE key = ?"
 
 
 @dataclass(frozen=True)
@@ -72,7 +74,13 @@ def held(path: Path, experiment: str) -> Held | None:
 def pages(output_dir: Path) -> dict[str, str]:
     """Key of a run -> its page in the UI that is opened on the folder's own database; empty if there is none."""
     found = asked(output_dir.absolute() / "mlflow.db", RUNS)
-    return {key: f"{LOCAL_UI}/#/experiments/{experiment}/runs/{run}" for key, experiment, run in found}
+    return {key: LOCAL_UI + run_page(str(experiment), run) for key, experiment, run in found}
+
+
+def table(output_dir: Path, sweep: str) -> str | None:
+    """The page of a sweep's table of runs in that UI; None where the database shows no such sweep."""
+    found = asked(output_dir.absolute() / "mlflow.db", TABLES, STATE + sweep)
+    return LOCAL_UI + table_page(str(found[0][0]), sweep) if found else None
 
 
 def asked(path: Path, question: str, *values: Any) -> list[Any]:

@@ -17,13 +17,14 @@ from typing import TYPE_CHECKING
 
 from dadiff.store import store_id
 from dadiff.store.files import locked
-from dadiff.tracking.content import Content, Piece, chunks
+from dadiff.tracking.content import Content, Data, Piece, chunks
 from dadiff.tracking.links import PARENT
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
-    from mlflow.entities import Run
+    from mlflow.entities import DatasetInput, Run
 
+CONTEXT = "mlflow.data.context"
 METRICS_AT_ONCE, PARAMS_AT_ONCE = 1000, 100  # that MLflow takes
 
 
@@ -55,6 +56,8 @@ class Mirror:
         for run in held:
             if run.info.run_id != run_id:
                 self._client.delete_run(run.info.run_id)
+        if kept and kept[0].info.run_name != piece.name:
+            self._client.update_run(run_id, name=piece.name)
         if parent is not None and not (kept and kept[0].data.tags.get(PARENT) == parent):
             self._client.set_tag(run_id, PARENT, parent)
         return run_id, not whole
@@ -123,9 +126,20 @@ def log_content(client: MlflowClient, run_id: str, content: Content) -> None:
     for batch in chunks(params, PARAMS_AT_ONCE):
         client.log_batch(run_id, params=batch)
     client.log_batch(run_id, tags=[RunTag(name, value) for name, value in content.tags.items()])
+    if content.inputs:
+        client.log_inputs(run_id, [_dataset(data) for data in content.inputs])
+    for key, picture in content.images.items():
+        client.log_image(run_id, picture, key=key, step=0)
     for folder, files in content.files.items():
         for path in files:
             client.log_artifact(run_id, str(path), folder or None)
+
+
+def _dataset(data: Data) -> DatasetInput:
+    from mlflow.entities import Dataset, DatasetInput, InputTag
+
+    dataset = Dataset(name=data.name, digest=data.digest, source_type="local", source=data.source)
+    return DatasetInput(dataset=dataset, tags=[InputTag(CONTEXT, data.context)])
 
 
 def _user() -> str:

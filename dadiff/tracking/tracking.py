@@ -12,10 +12,12 @@ from dadiff.errors import ConfigError
 from dadiff.outside import without_passwords
 from dadiff.store import StoredRun, Sweep, Sweeps, store_id
 from dadiff.tracking.client import open_client, prepare_store, spared
-from dadiff.tracking.content import Piece, run_piece, sweep_piece, sweep_view, training_piece
+from dadiff.tracking.content import Piece, run_piece, sweep_piece, training_piece
 from dadiff.tracking.database import SQLITE, damage_of
-from dadiff.tracking.links import Held, held
+from dadiff.tracking.links import LOCAL_UI, Held, held
 from dadiff.tracking.mirror import opened
+from dadiff.tracking.models import log_models
+from dadiff.tracking.views import STATE, short_names, sweep_view, table_page
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -73,13 +75,14 @@ class Tracking:
         if self.enabled:
             _ = self._experiment_id
 
-    def log_run(self, run: StoredRun, parent: str | None = None) -> None:
+    def log_run(self, run: StoredRun, parent: str | None = None, name: str | None = None) -> None:
         """Mirror a stored run.
 
         Args:
             parent: the MLflow run of its sweep.
+            name: what its sweep calls it; None for its own name.
         """
-        self._log(run.folder.parent.parent, run_piece(run), parent)
+        self._log(run.folder.parent.parent, run_piece(run, name), parent)
 
     def log_training(self, output_dir: Path | str, key: str) -> None:
         """Mirror a cached training as an MLflow run of its own, if it is in the cache."""
@@ -103,19 +106,22 @@ class Tracking:
         """
         if not self.enabled:
             return 0
-        brought, parents = 0, dict[str, str]()
+        brought, parents, named, ids = 0, dict[str, str](), dict[str, str](), dict[str, str]()
         with opened(self._client, self._experiment_id, output_dir) as mirror:
             for name in sweeps:
                 run_id, missed = mirror.bring(sweep_piece(output_dir, name))
                 sweep = Sweeps(output_dir).read(name)
                 self._show(sweep, run_id)
                 parents = {cell.key: run_id for cell in sweep.cells} | parents
+                named = short_names(sweep) | named
                 brought += missed
             for piece in filter(None, (training_piece(output_dir, key) for key in _trainings(runs))):
                 brought += mirror.bring(piece)[1]
             for run in runs:
-                brought += mirror.bring(run_piece(run), parents.get(run.key))[1]
+                ids[run.key], missed = mirror.bring(run_piece(run, named.get(run.key)), parents.get(run.key))
+                brought += missed
             mirror.tidy()
+            log_models(self._client, self._experiment_id, runs, ids)
         return brought
 
     def mirrors(self, output_dir: Path | str, runs: Sequence[StoredRun], sweep: str | None = None) -> bool:
@@ -152,10 +158,10 @@ class Tracking:
             return "tracking is off"
         found = self._held()
         experiment_id = self._experiment_id if found is None else found.experiment_id
-        page = f"/#/experiments/{experiment_id}/runs?viewStateShareKey={sweep_name}"
+        page = table_page(experiment_id, sweep_name)
         if self.uri.startswith("http"):
             return f"open {without_passwords(self.uri)}{page}"
-        return f"mlflow ui --backend-store-uri {self.uri}   then open http://127.0.0.1:5000{page}"
+        return f"mlflow ui --backend-store-uri {self.uri}   then open {LOCAL_UI}{page}"
 
     @cached_property
     def _experiment_id(self) -> str:
@@ -184,4 +190,4 @@ def _trainings(runs: Iterable[StoredRun]) -> list[str]:
 
 def _view(sweep_name: str) -> str:
     """The experiment's tag that holds the state of the page that shows a sweep."""
-    return f"mlflow.sharedViewState.{sweep_name}"
+    return f"{STATE}{sweep_name}"
