@@ -25,6 +25,7 @@ class Fault:
         place: of the changed node in the order of `ast.walk`.
         lines: of the simple statement, or of the head of the compound one, that it stands in.
         function: the lines of the function.
+        compiled: whether it is machine code, which cannot be replaced in a running process.
     """
 
     file: Path
@@ -33,6 +34,7 @@ class Fault:
     lines: range
     function: range
     change: str
+    compiled: bool
 
     @property
     def name(self) -> str:
@@ -75,10 +77,11 @@ def faults(file: Path) -> Iterator[Fault]:
     places = {id(node): place for place, node in enumerate(ast.walk(tree))}
     for function in ast.walk(tree):
         if isinstance(function, ast.FunctionDef):
+            compiled = any(isinstance(mark, ast.Name) and mark.id == "compiled" for mark in function.decorator_list)
             for node, lines in _read(function):
                 if what := change(copy.deepcopy(node)):
                     line = getattr(node, "lineno", lines.start)
-                    yield Fault(file, places[id(node)], line, lines, _lines(function), what)
+                    yield Fault(file, places[id(node)], line, lines, _lines(function), what, compiled)
 
 
 def _read(function: ast.FunctionDef) -> Iterator[tuple[ast.AST, range]]:
