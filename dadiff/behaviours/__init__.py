@@ -1,22 +1,9 @@
 """Behaviours: the sets of admissible trajectories, what they are learned from, and the projections onto them."""
 
-from dadiff.behaviours.components import (
-    Hankel,
-    HankelLowRank,
-    Identified,
-    IdentifiedSoft,
-    Inpainting,
-    Known,
-    KnownClear,
-    Koopman,
-    Nominal,
-    NoProjector,
-    Projector,
-    RolloutProjector,
-    pins,
-)
 from dadiff.behaviours.doubt import Doubted
 from dadiff.behaviours.family import IdentifiedFamily
+from dadiff.behaviours.identified import Identified, IdentifiedSoft, Koopman
+from dadiff.behaviours.known import Inpainting, Known, KnownClear, Nominal, NoProjector, RolloutProjector
 from dadiff.behaviours.least_squares import Estimate, Transitions, least_squares
 from dadiff.behaviours.lifted import Lifted
 from dadiff.behaviours.limited import Limited
@@ -24,14 +11,17 @@ from dadiff.behaviours.manifold import Manifold
 from dadiff.behaviours.pins import Pin
 from dadiff.behaviours.prediction import model_of, prediction_error
 from dadiff.behaviours.projection import Projection, ProjectionInfo
+from dadiff.behaviours.projector import Fitted, Projector, Sources, pins, starts_fixed
 from dadiff.behaviours.sets import Dynamics, Everything, Rollout, Span, TrajectorySet, Uncertain, compared
 from dadiff.behaviours.stages import Stages
+from dadiff.behaviours.windows import Hankel, HankelLowRank
 
 __all__ = [
     "Doubted",
     "Dynamics",
     "Estimate",
     "Everything",
+    "Fitted",
     "Hankel",
     "HankelLowRank",
     "Identified",
@@ -52,6 +42,7 @@ __all__ = [
     "Projector",
     "Rollout",
     "RolloutProjector",
+    "Sources",
     "Span",
     "Stages",
     "TrajectorySet",
@@ -62,4 +53,5 @@ __all__ = [
     "model_of",
     "pins",
     "prediction_error",
+    "starts_fixed",
 ]

@@ -9,14 +9,15 @@ the maximisation takes the mean and the spread of that.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 
 from dadiff.behaviours.least_squares import Offset, Transitions, least_squares
+from dadiff.behaviours.projector import RECORDING, Fitted, Sources, told
 from dadiff.behaviours.sets import InitialState, Uncertain
-from dadiff.behaviours.stages import Stages, stages_of, transposed
+from dadiff.behaviours.stages import Stages, transposed
 from dadiff.errors import ConfigError
-from dadiff.systems import Recording, System
 from dadiff.trajectory.layout import TrajectoryLayout
 from dadiff.trajectory.subspace import semidefinite_root
 
@@ -190,7 +191,7 @@ class Channels:
 
 
 @dataclass(frozen=True)
-class IdentifiedFamily:
+class IdentifiedFamily(Fitted[Uncertain]):
     """One robot's dynamics from a short recording, and from what demonstrations of its family say is usual.
 
     The posterior of empirical Bayes, each direction trusted by how well it is known, see `Uncertain`; the recording may
@@ -203,6 +204,7 @@ class IdentifiedFamily:
         offset: each robot's c is `none`, `estimated` as A and B are, or `known` and the same for all robots.
     """
 
+    label: ClassVar[str] = "identified_family"
     initial_state: InitialState = "free"
     inflation: float = 1.0
     offset: Offset = "none"
@@ -210,26 +212,16 @@ class IdentifiedFamily:
     @property
     def needs(self) -> frozenset[str]:
         """A recording and demonstrations, and the system whose offset is known."""
-        return frozenset({"recording", "demonstrations"} | ({"system"} if self.offset == "known" else set()))
+        return told(RECORDING | {"demonstrations"}, self.offset)
 
     def __post_init__(self) -> None:
         if not 0 < self.inflation < np.inf:
             raise ConfigError(f"projector: inflation is {self.inflation}; it must be positive and finite")
 
-    def fit(
-        self,
-        layout: TrajectoryLayout,
-        system: System | None = None,
-        recording: Recording | None = None,
-        demonstrations: np.ndarray | None = None,
-    ) -> Uncertain:
+    def find(self, layout: TrajectoryLayout, sources: Sources) -> Uncertain:
         """The trajectories of the expected dynamics, and the covariance of the residual."""
-        if recording is None or demonstrations is None:
-            missing = "recording" if recording is None else "dataset"
-            raise ConfigError(
-                f"projector identified_family needs a {missing}, and none is given; choose one with {missing}=..."
-            )
-        c, constant = self._known(layout, system), self.offset == "estimated"
+        recording, demonstrations = sources.recording, sources.demonstrations
+        c, constant = self._known(layout, sources), self.offset == "estimated"
         channels = Channels.of(layout, demonstrations, centred=constant)
         shown, size = channels.scaled_trajectories(layout, demonstrations), channels.size_x
         seen = channels.scaled(Transitions.of(recording.states, recording.inputs)).less(c / size)
@@ -241,13 +233,11 @@ class IdentifiedFamily:
         notes = {"rank": layout.rank, "residual_deviation": deviation}
         return Uncertain(layout, channels.physical(belief.stages(layout), c), spread, notes=notes)
 
-    def _known(self, layout: TrajectoryLayout, system: System | None) -> np.ndarray:
+    def _known(self, layout: TrajectoryLayout, sources: Sources) -> np.ndarray:
         """c (n,), 0 unless it is known."""
-        if self.offset != "known":
+        if (known := sources.offset(self.offset)) is None:
             return np.zeros(layout.state_dim)
-        if system is None:
-            raise ConfigError("projector identified_family needs a system, whose offset is known; give one")
-        c = stages_of(system, 1).c.reshape(-1, layout.state_dim)
+        c = known.reshape(-1, layout.state_dim)
         if np.ptp(c, axis=0).any():
             raise ConfigError(
                 "projector identified_family: the robots' offsets differ, and those of the demonstrations are not "

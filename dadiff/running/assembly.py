@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dadiff.behaviours import TrajectorySet
+from dadiff.behaviours import TrajectorySet, starts_fixed
 from dadiff.datasets.cached import load_data, save_data
 from dadiff.denoisers.recipes import ExactRecipe, Recipe
 from dadiff.diffusion.estimate import Estimate
@@ -182,7 +182,7 @@ class Experiment:
             self.coordinates,
             behaviour,
             self.parts.enforcement,
-            getattr(self.parts.projector, "initial_state", "free") == "fixed",
+            starts_fixed(self.parts.projector),
             self.parts.evaluation.divergence_bound,
             self.device,
             self.estimate if self.parts.enforcement.weighs and behaviour is not None else None,

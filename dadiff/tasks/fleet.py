@@ -53,8 +53,8 @@ class Fleet(ManyRobots):
 
     def stretched(self, factor: float) -> Fleet:
         """The same task with the ranges of starts and targets times `factor`."""
-        ranges = {name: stretched(getattr(self, name), factor) for name in ("init_range", "target_range")}
-        return replace(self, **ranges)
+        init, target = (stretched(given, factor) for given in (self.init_range, self.target_range))
+        return replace(self, init_range=init, target_range=target)
 
     def target(self, system: LinearFamily) -> LinearRobots:
         """The test robots: those inside the ranges, then those outside.

@@ -84,8 +84,8 @@ class LQR:
 
     def stretched(self, factor: float) -> LQR:
         """The same task with the ranges of starts and targets times `factor`."""
-        ranges = {name: stretched(getattr(self, name), factor) for name in ("init_range", "target_range")}
-        return replace(self, **ranges)
+        init, target = (stretched(given, factor) for given in (self.init_range, self.target_range))
+        return replace(self, init_range=init, target_range=target)
 
     def cost(self, system: AffineSystem) -> QuadraticCost:
         """What a trajectory costs.

@@ -67,8 +67,8 @@ class Manoeuvre(ManyRobots):
 
     def stretched(self, factor: float) -> Manoeuvre:
         """The same task with the ranges of starts and targets times `factor`."""
-        ranges = {name: [factor * value for value in getattr(self, name)] for name in ("init_range", "target_range")}
-        return replace(self, **ranges)
+        init, target = ([factor * value for value in given] for given in (self.init_range, self.target_range))
+        return replace(self, init_range=init, target_range=target)
 
     def target(self, system: Family) -> Robots:
         """The test robots: those inside the ranges, then those outside.
