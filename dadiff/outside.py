@@ -29,6 +29,9 @@ UNREADABLE = (
 )
 """What zipfile and numpy raise on damaged, encrypted or unknown content, and on pickled objects."""
 
+OBJECTS = "it holds Python objects, which are never loaded: write numbers, and runs of different lengths as files"
+"""What to say of an array that only pickle reads."""
+
 MOST_TEXT = 64 * 2**20
 """Bytes of a json or yaml file: the largest of ours, the record of a sweep of 10,000 cells, has 20 MB."""
 
@@ -146,7 +149,8 @@ def npz(path: Path, what: str = "an array") -> Iterator[np.lib.npyio.NpzFile]:
         with np.load(path, allow_pickle=False) as arrays:
             yield arrays
     except UNREADABLE as error:
-        raise DataError(f"{path}: {what} cannot be read ({' '.join(str(error).split())})") from error
+        found = OBJECTS if "Object arrays" in str(error) else " ".join(str(error).split())
+        raise DataError(f"{path}: {what} cannot be read ({found})") from error
 
 
 def _check_headers(archive: zipfile.ZipFile, path: Path) -> None:

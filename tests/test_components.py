@@ -18,6 +18,7 @@ GIVEN = {
     ("dataset", "npz"): ["dataset.path=somewhere"],
     ("dataset", "environments"): ["dataset.path=somewhere.yaml"],
     ("system", "inline"): ["system.A=[[1,0.1],[0,1]]", "system.B=[[0],[0.1]]"],
+    ("system", "unknown"): ["system.states=4", "system.inputs=2"],
     ("recording", "npz"): ["recording.path=somewhere"],
 }
 # Where a component stands for what its methods ask of it.

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pandas as pd
 import pytest
 
 from dadiff.datasets import NpzRecordings, NpzTrajectories
-from dadiff.datasets.physics import check_excited, mismatch
+from dadiff.datasets.excitation import check_excited, tell_held
+from dadiff.datasets.physics import mismatch
 from dadiff.errors import DataError, ExcitationError
-from dadiff.systems import double_integrator
+from dadiff.systems import Linear, double_integrator, unknown
 from dadiff.tasks import LQR
 
-SYSTEM = double_integrator()
+SYSTEM, UNKNOWN = double_integrator(), unknown(4, 2)
 COLUMNS = {"states": ["x", "y", "vx", "vy"], "inputs": ["ax", "ay"]}
 
 
@@ -49,6 +52,16 @@ HARMED = {
     "swapped inputs": (X, U[:, ::-1], "inputs in the other order fit"),
     "centimetres": (X * [100, 1, 1, 1], U, "state 0 taken 0.01 times"),
     "kilonewtons": (X, U / 1000, "every input taken 1000 times"),
+    "weak actuators": (
+        run(system=replace(SYSTEM, B=SYSTEM.B * [1.0, 0.4]))[0],
+        U,
+        r"act \(1, 0\.4\) times as strongly",
+    ),
+    "another model": (
+        run(system=replace(SYSTEM, A=SYSTEM.A - 0.1 * np.eye(4)))[0],
+        U,
+        "of their own fit: another robot",
+    ),
     "glued": (
         np.concatenate([run(40, k, 1.0 * k)[0][:-1] for k in range(8)] + [run(40, 7, 7.0)[0][-1:]]),
         np.concatenate([run(40, k)[1] for k in range(8)]),
@@ -70,6 +83,63 @@ def test_what_is_wrong_with_data_is_found_and_named(name, tmp_path):
             NpzRecordings(str(tmp_path)).record(SYSTEM)
         assert "\n" not in str(told.value)
     assert NpzRecordings(str(tmp_path), allow_mismatch=True).record(SYSTEM).notes["recording_residual"] == found.ratio
+
+
+@pytest.mark.parametrize("bad", ["glitch", "order", "trim"])
+def test_one_bad_file_among_many_is_found_and_named(bad, tmp_path):
+    for k in range(30):
+        states, inputs = HARMED[bad][:2] if k == 17 else run(seed=k + 1)
+        np.savez(tmp_path / f"{k:02d}.npz", states=states[:31], inputs=inputs[:30])
+    tau = [np.load(file) for file in sorted(tmp_path.glob("*.npz"))]
+    found = mismatch(SYSTEM, np.stack([t["states"] for t in tau]), np.stack([t["inputs"] for t in tau]))
+    assert found.worst[0] == 17 or bad == "glitch"  # which lies after its first 30 steps
+    assert bad == "glitch" or "the other 29 of 30 trajectories obey it" in found.cause
+
+
+def test_a_robot_of_a_fleet_is_judged_like_a_system(tmp_path):
+    robots = Linear(np.stack([SYSTEM.A] * 2), np.stack([SYSTEM.B, 0.3 * SYSTEM.B]), process_noise=0.01, robots=2)
+    for k in range(2):
+        (tmp_path / f"robot_{k}").mkdir()
+        np.savez(tmp_path / f"robot_{k}" / "a.npz", states=X, inputs=U)
+    with pytest.raises(DataError, match=r"robot_1/a\.npz: the data do not obey .*times as strongly fit"):
+        NpzRecordings(str(tmp_path)).record(robots)
+    notes = NpzRecordings(str(tmp_path), allow_mismatch=True).record(robots).notes
+    assert notes["recording_residual"] > 5
+
+
+@pytest.mark.parametrize(("harm", "told"), [
+    ("padding", "padding"), ("glitch", "single glitches"), ("glued", "glued episodes"), ("delay", "one sample later"),
+    ("zeros", "lost samples"), ("shift", "one sample earlier"),
+])  # fmt: skip
+def test_data_of_an_unknown_system_are_held_against_what_fits_them(harm, told, tmp_path, caplog):
+    states, inputs, _ = HARMED[harm]
+    np.savez(tmp_path / "a.npz", states=states, inputs=inputs)
+    NpzRecordings(str(tmp_path), allow_mismatch=True).record(UNKNOWN)
+    assert told in caplog.text
+
+
+@pytest.mark.parametrize("harm", ["trim", "rate", "order", "interleaved", "centimetres", "kilonewtons"])
+def test_what_needs_no_system_to_be_right_is_no_matter_where_it_is_unknown(harm, tmp_path, caplog):
+    states, inputs, _ = HARMED[harm]
+    np.savez(tmp_path / "a.npz", states=states, inputs=inputs)
+    assert NpzRecordings(str(tmp_path)).record(UNKNOWN).notes["recording_residual"] == pytest.approx(1, abs=0.1)
+    assert not caplog.text
+
+
+@pytest.mark.parametrize("system", ["known", "unknown"])
+def test_files_of_two_plants_disagree(system, tmp_path, caplog):
+    np.savez(tmp_path / "a.npz", states=X, inputs=U)
+    np.savez(tmp_path / "b.npz", states=run(system=replace(SYSTEM, B=SYSTEM.B / 2))[0], inputs=U)
+    NpzRecordings(str(tmp_path)).record(UNKNOWN if system == "unknown" else SYSTEM)
+    assert "times as strongly fit: an actuator that was changed" in caplog.text
+
+
+@pytest.mark.parametrize("harm", ["trim", "offset"])
+def test_with_an_offset_estimated_such_data_are_as_good_as_any(harm, tmp_path, caplog):
+    np.savez(tmp_path / "a.npz", states=HARMED["trim"][0], inputs=HARMED["trim"][1])
+    notes = NpzRecordings(str(tmp_path), offset="estimated").record(SYSTEM).notes
+    assert notes["recording_residual"] == pytest.approx(1, abs=0.05)
+    assert "the robot has an offset that the configured system has not, c = [" in caplog.text
 
 
 def test_good_data_have_a_residual_of_one_and_cost_no_word(tmp_path, caplog):
@@ -107,7 +177,18 @@ def test_inputs_that_do_not_excite_are_refused_in_every_precision_and_unit(name,
         check_excited(scale * np.asarray(POOR[name], dtype=np.float64)[None], 5, "where")
 
 
-@pytest.mark.parametrize("inputs", [U, (U > 0).astype(float), np.repeat(U[::2], 2, axis=0), U * [1e-3, 1e3]])
+@pytest.mark.parametrize(("inputs", "samples"), [
+    (np.repeat(U[::3], 3, axis=0), 3), (U, 1), (np.repeat(U[::2], 2, axis=0)[:, [0]], 2), ((U > 0).astype(float), 1),
+    (np.stack([np.repeat(U[::2, 0], 2), U[:, 1]], -1), 1), (np.full((20, 2), 0.3), 1),
+])  # fmt: skip
+def test_inputs_that_are_held_are_noticed(inputs, samples, caplog):
+    assert tell_held([inputs], "where") == samples
+    assert ("held for" in caplog.text) == (samples > 1)
+
+
+@pytest.mark.parametrize(
+    "inputs", [9.81 + 0.1 * U, U, (U > 0).astype(float), np.repeat(U[::2], 2, axis=0), U * [1e-3, 1e3]]
+)
 def test_inputs_that_excite_are_taken(inputs):
     assert check_excited(inputs[None], 5, "where") < 100
 
@@ -122,6 +203,10 @@ FORMS = {
     "metadata": {"states": X, "inputs": U, "meta": np.array({"robot": 7}, dtype=object)},
     "time": {"states": X, "inputs": U, "time": 0.1 * np.arange(301)},
     "dt": {"states": X, "inputs": U, "dt": np.array(0.1)},
+    "uneven time": {"states": X, "inputs": U, "time": 0.1 * np.arange(301) + 0.02 * np.sin(np.arange(301))},
+    "long double": {"states": X.astype(np.longdouble), "inputs": U},
+    "big endian": {"states": X.astype(">f8"), "inputs": U.astype(">f4")},
+    "Fortran": {"states": np.asfortranarray(X), "inputs": np.asfortranarray(U)},
 }
 
 
@@ -146,7 +231,10 @@ def test_tables_are_read_by_the_names_of_their_columns(ending, tmp_path):
 REFUSED = {
     "transposed": ({"states": X.T, "inputs": U.T}, r"shape \(4, 301\); expected \(any, 4\); transpose it\?"),
     "outputs": ({"u": U, "y": X[1:, :1]}, "input-output data are not offered"),
-    "objects": ({"states": np.array([X, X[:5]], dtype=object), "inputs": U}, "Object arrays cannot be loaded"),
+    "objects": (
+        {"states": np.array([X, X[:5]], dtype=object), "inputs": U},
+        "array states cannot be read .it holds Python objects",
+    ),
     "nan": ({"states": at(X, (7, 0), np.nan), "inputs": U}, "not finite, first in row 7"),
     "rows": ({"states": X[:-5], "inputs": U}, "has 296 states and 300 inputs; expected one state more, or as many"),
     "time": (
@@ -167,12 +255,103 @@ def test_what_cannot_is_refused_with_the_remedy(name, tmp_path):
         NpzRecordings(str(tmp_path)).record(SYSTEM)
 
 
+JUMPING = {
+    "starts anew": np.concatenate([0.1 * np.arange(40)] * 7 + [0.1 * np.arange(41)]),
+    "a gap": 0.1 * np.arange(321) + np.repeat(np.arange(9), 40)[:321] * 3.0,
+}
+
+
+@pytest.mark.parametrize("name", JUMPING)
+def test_time_stamps_that_jump_cut_a_file_into_episodes(name, tmp_path, caplog):
+    states, inputs, _ = HARMED["glued"]
+    np.savez(tmp_path / "a.npz", states=states, inputs=inputs, time=JUMPING[name])
+    assert NpzRecordings(str(tmp_path)).record(SYSTEM).notes["recording_residual"] == pytest.approx(1, abs=0.1)
+    assert "its time stamps jump before row 40, 80" in caplog.text
+
+
+def written_as(kind: str, folder: Path, runs) -> dict | None:
+    """Runs in the files of others; returns how the columns are called, where that has to be said."""
+    folder.mkdir()
+    if kind == "minari":
+        with h5py.File(folder / "main_data.hdf5", "w") as file:
+            for k, (x, u) in enumerate(runs):
+                file[f"episode_{k}/observations"], file[f"episode_{k}/actions"] = x, u
+        return None
+    if kind == "d4rl":
+        ends = np.cumsum([len(x) for x, _ in runs])
+        with h5py.File(folder / "maze.hdf5", "w") as file:
+            file["observations"] = np.concatenate([x for x, _ in runs])
+            file["actions"] = np.concatenate([np.vstack([u, u[-1:]]) for _, u in runs])
+            file["terminals"] = np.zeros(ends[-1], bool)
+            file["timeouts"] = np.isin(np.arange(ends[-1]), ends - 1)
+        return None
+    tables = [pd.DataFrame({"observation.state": list(x[:-1]), "action": list(u), "episode_index": k,
+                            "timestamp": 0.1 * np.arange(len(u))}) for k, (x, u) in enumerate(runs)]  # fmt: skip
+    if kind == "lerobot":
+        (folder / "data" / "chunk-000").mkdir(parents=True)
+        (folder / "meta").mkdir()
+        pd.DataFrame({"task": ["go"]}).to_parquet(folder / "meta" / "tasks.parquet")
+        for k, table in enumerate(tables):
+            table.to_parquet(folder / "data" / "chunk-000" / f"episode_{k:06d}.parquet")
+        return None
+    names = [*COLUMNS["states"], *COLUMNS["inputs"]]
+    times = [pd.date_range("2026-01-01", periods=len(u), freq="100ms") for _, u in runs]
+    wide = [pd.DataFrame(np.hstack([x[:-1], u]), columns=names).assign(run=k, t=times[k])
+            for k, (x, u) in enumerate(runs)]  # fmt: skip
+    options = {"sep": ";", "decimal": ","} if kind == "semicolons" else {}
+    pd.concat(wide).to_csv(folder / "all.csv", index=False, encoding="utf-8-sig", **options)
+    return COLUMNS | {"episode": "run", "time": "t"}
+
+
+@pytest.mark.parametrize("kind", ["minari", "d4rl", "lerobot", "csv", "semicolons"])
+def test_episodes_are_read_as_others_write_them(kind, tmp_path):
+    runs = [run(40 + 7 * k, k, 1.0 * k) for k in range(4)]
+    columns = written_as(kind, tmp_path / "data", runs)
+    recording = NpzRecordings(str(tmp_path / "data"), columns).record(SYSTEM)
+    assert recording.notes["recording_residual"] == pytest.approx(1, abs=0.15)
+    for (x, u), (states, inputs) in zip(runs, recording.runs, strict=True):
+        np.testing.assert_allclose(states, x[: len(states)], rtol=1e-6)
+        np.testing.assert_allclose(inputs, u[: len(inputs)], rtol=1e-6)
+        assert len(inputs) >= len(u) - 1
+
+
+@pytest.mark.parametrize(("write", "told"), [
+    (lambda f: f.create_group("observations").create_dataset("state", data=X), "observations is a group of state;"),
+    (lambda f: f.__setitem__("observations", h5py.ExternalLink("/etc/passwd", "/")), "lies in another file"),
+    (lambda f: f.create_dataset("observations", (10**9, 10**4), dtype="f8"), "observations holds .* of memory"),
+    (lambda f: None, "has no array states or observations; found"),
+])  # fmt: skip
+def test_hdf5_that_cannot_be_taken_is_refused(write, told, tmp_path):
+    with h5py.File(tmp_path / "a.hdf5", "w") as file:
+        write(file)
+        file["actions"] = U
+    with pytest.raises(DataError, match=told):
+        NpzRecordings(str(tmp_path)).record(SYSTEM)
+    (tmp_path / "a.hdf5").write_bytes(b"not hdf5 at all")
+    with pytest.raises(DataError, match=r"a\.hdf5: cannot be read as HDF5"):
+        NpzRecordings(str(tmp_path)).record(SYSTEM)
+
+
+@pytest.mark.parametrize(("content", "told"), [
+    ("x,y,vx,vy,ax,ay\nm,m,m/s,m/s,m/s2,m/s2\n0,0,0,0,1,1\n", "column 'x' holds 'm' in row 0; expected numbers"),
+    ("x,y,vx,vy,ax,ay\n0,0,0,0,1,1\n1,,0,0,1,1\n0,0,0,0,1,1\n", "states holds .* not finite, first in row 1"),
+    ("0,0,0,0,1,1\n0,0,0,0,1,1\n", "has no column 'x'; found 0"),
+    ("x,y,vx,vy,ax,ay\n", "has 0 states and 0 inputs|cannot be read|not finite|at least two states"),
+    ("", "cannot be read as a table"),
+    ("x,y\n1,2,3\n1\n\"", "cannot be read as a table|has no column"),
+])  # fmt: skip
+def test_tables_that_cannot_be_taken_are_refused_with_the_remedy(content, told, tmp_path):
+    (tmp_path / "a.csv").write_text(content)
+    with pytest.raises(DataError, match=rf"a\.csv: .*({told})"):
+        NpzRecordings(str(tmp_path), COLUMNS).record(SYSTEM)
+
+
 def test_episodes_in_one_file_are_cut_where_they_end(tmp_path):
     states, inputs, _ = HARMED["glued"]
     np.savez(tmp_path / "a.npz", states=states, inputs=inputs, episode_ends=40 * np.arange(1, 9))
     recording = NpzRecordings(str(tmp_path)).record(SYSTEM)
     assert recording.notes["recording_residual"] == pytest.approx(1, abs=0.1)
-    assert recording.length == 39
+    assert sorted(np.isfinite(recording.inputs[..., 0]).sum(-1)) == [39] * 7 + [40]
 
 
 def demonstrations(folder: Path, count: int, seed: int = 0) -> None:
@@ -187,7 +366,7 @@ def test_demonstrations_are_held_against_the_system_and_against_the_test_set(tmp
     demonstrations(tmp_path / "test", 5, seed=17)
     data = NpzTrajectories(str(tmp_path))
     assert data.train(LQR(), SYSTEM).notes["residual"] == pytest.approx(1, abs=0.1)
-    assert data.test(LQR(), SYSTEM).notes == {"also_in_train": 3}
+    assert data.test(LQR(), SYSTEM).notes == {"also_in_train": 3, "residual": pytest.approx(1, abs=0.1)}
     assert "3 of 5 test trajectories are also in train" in caplog.text
     with pytest.raises(DataError, match=r"train: the data do not obey .* another sampling rate"):
         data.train(LQR(), double_integrator(time_step=0.2))

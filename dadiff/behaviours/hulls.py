@@ -102,8 +102,8 @@ def drift(system: System, layout: TrajectoryLayout) -> np.ndarray:
 
 def _channel_sizes(recording: Recording, layout: TrajectoryLayout) -> np.ndarray:
     """What each entry of tau is taken over, (*robots, d): the same at all times; 1 where nothing moves."""
-    steps = np.sqrt(np.square(np.diff(recording.states, axis=-2)).mean(axis=(-3, -2)))
-    inputs = recording.inputs.std(axis=(-3, -2)) / INPUT_WEIGHT
+    steps = np.sqrt(np.nanmean(np.square(np.diff(recording.states, axis=-2)), axis=(-3, -2)))
+    inputs = np.nanstd(recording.inputs, axis=(-3, -2)) / INPUT_WEIGHT
     x, u = (np.where(size > 0, size, 1.0)[..., None, :] for size in (steps, inputs))
     return layout.flatten(np.repeat(x, layout.horizon + 1, axis=-2), np.repeat(u, layout.horizon, axis=-2))
 

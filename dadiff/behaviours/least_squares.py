@@ -36,8 +36,14 @@ class Transitions:
 
     @classmethod
     def of(cls, states: np.ndarray, inputs: np.ndarray) -> Transitions:
-        """All transitions of experiments: states (*robots, count, S+1, n), inputs (*robots, count, S, m)."""
-        return cls(_joined(states[..., :-1, :]), _joined(inputs), _joined(states[..., 1:, :]))
+        """All transitions of experiments: states (*robots, count, S+1, n), inputs (*robots, count, S, m).
+
+        Of a single system they may differ in length, nan standing after their end.
+        """
+        made = [_joined(states[..., :-1, :]), _joined(inputs), _joined(states[..., 1:, :])]
+        if made[0].ndim == 2 and (ended := np.isnan(np.concatenate(made, axis=-1)).any(axis=-1)).any():
+            made = [values[~ended] for values in made]
+        return cls(*made)
 
     def less(self, c: np.ndarray) -> Transitions:
         """Those of the same dynamics without an offset c (*robots, n)."""

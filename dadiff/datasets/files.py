@@ -9,16 +9,17 @@ import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 
+from dadiff.datasets.excitation import check_excited, tell_held
 from dadiff.datasets.generated import Part
-from dadiff.datasets.logs import ENDINGS, list_logs, of_one_length, read_runs
-from dadiff.datasets.physics import check_excited, judge
-from dadiff.errors import ConfigError, DataError
+from dadiff.datasets.logs import ENDINGS, list_logs, read_runs, side_by_side
+from dadiff.datasets.physics import judge, judge_runs, plant_of, tell_offset, tell_shifted
+from dadiff.errors import ConfigError, DataError, NotApplicableError
 from dadiff.outside import digest_of, npz
-from dadiff.systems import Recording, System
+from dadiff.systems import Recording, System, TimeVarying
 from dadiff.tasks import Cases, Demonstrations, Task
 
 INPUT_NAMES = ("inputs", "controls")
@@ -111,9 +112,11 @@ class NpzTrajectories:
     def train(self, task: Task, system: System) -> Demonstrations:
         """The trajectories of `path`/train."""
         tau, environment = self._read("train", task, system, self.train_size)
-        states, inputs = system.layout(task.horizon).split(tau)
-        ratio = judge(system, states, inputs, str(Path(self.path) / "train"), self.allow_mismatch)
-        return Demonstrations(tau, environment, {"residual": ratio})
+        copies = len(tau) - len({row.tobytes() for row in tau})
+        if copies:
+            log.warning("%s/train: %d of %d trajectories are copies of others", self.path, copies, len(tau))
+        residual = self._judged("train", system, task.horizon, tau, tau)
+        return Demonstrations(tau, environment, {"residual": residual, "copies": copies})
 
     def test(self, task: Task, system: System) -> Cases:
         """The cases of `path`/test."""
@@ -122,7 +125,18 @@ class NpzTrajectories:
         shared = len({row.tobytes() for row in learned} & {row.tobytes() for row in tau})
         if shared:
             log.warning("%s: %d of %d test trajectories are also in train", self.path, shared, len(tau))
-        return Cases(task.condition(system), environment, tau, {"also_in_train": shared})
+        residual = self._judged("test", system, task.horizon, tau, learned)
+        return Cases(task.condition(system), environment, tau, {"also_in_train": shared, "residual": residual})
+
+    def _judged(self, part: Part, system: System, horizon: int, tau: np.ndarray, learned: np.ndarray) -> float:
+        """How well trajectories (N, d) obey the system; of an unknown one, those that are learned from."""
+        layout, folder = system.layout(horizon), Path(self.path) / part
+        runs = list(zip(*layout.split(learned), strict=True))
+        plant = plant_of(system, runs)
+        if plant.learned and part == "train":
+            tell_shifted(runs, str(folder))
+        names = [file.name for file in list_files(folder)[: len(tau)]]
+        return judge(plant, *layout.split(tau), str(folder), self.allow_mismatch, names)
 
     def _read(self, part: str, task: Task, system: System, count: int | None) -> tuple[np.ndarray, np.ndarray]:
         if not isinstance(system, System) or system.robots:
@@ -151,20 +165,22 @@ class NpzTrajectories:
 
 @dataclass(frozen=True)
 class NpzRecordings:
-    """Own recordings Γ: a folder of .npz, .csv or .parquet files with `states` and `inputs` or `controls`.
+    """Own recordings Γ: a folder of .npz, .csv, .parquet or .hdf5 files with `states` and `inputs`.
 
     Of a fleet, one such folder a robot: `path`/robot_0, robot_1, ... See `dadiff.datasets.logs` for what is taken.
     They are held against the configured system, see `dadiff.datasets.physics`.
 
     Args:
         path: the folder.
-        columns: of tables, `states` and `inputs` as lists of column names.
+        columns: of tables, `states` and `inputs` as lists of column names; `episode` and `time` as names.
         allow_mismatch: take data that do not obey the configured system, with a warning.
+        offset: `estimated` holds them against the system up to a constant offset, which the projector learns.
     """
 
     path: str
-    columns: Mapping[str, Sequence[str]] | None = None
+    columns: Mapping[str, str | Sequence[str]] | None = None
     allow_mismatch: bool = False
+    offset: Literal["none", "estimated", "known"] = "none"
 
     def fingerprint(self) -> str:
         """What the folder holds, in place of where it lies."""
@@ -179,7 +195,12 @@ class NpzRecordings:
         Raises:
             DataError: if a file's sizes disagree with the system, or its steps; if a robot has no folder, or another
                 number or length of recordings than the first one.
+            NotApplicableError: if the system varies in time.
         """
+        if isinstance(system, TimeVarying):
+            raise NotApplicableError(
+                "recording: the system varies in time, what is learned from recordings does not; use projector=known"
+            )
         if not system.robots:
             return self._read(Path(self.path), system)
         folders = [Path(self.path) / f"robot_{k}" for k in range(system.robots[0])]
@@ -188,26 +209,41 @@ class NpzRecordings:
                 f"{self.path}: no recordings for {', '.join(missing)}; expected one folder for each of "
                 f"{len(folders)} robots"
             )
-        recordings = [self._read(folder, system, judged=False) for folder in folders]
-        for folder, recording in zip(folders, recordings, strict=True):
-            if recording.inputs.shape != recordings[0].inputs.shape:
-                raise DataError(
-                    f"{folder}: holds {recording.count} recordings with S = {recording.length}, {folders[0].name} "
-                    f"{recordings[0].count} with {recordings[0].length}; cut to equal number and S"
-                )
-        return Recording(np.stack([r.states for r in recordings]), np.stack([r.inputs for r in recordings]))
+        return _together(folders, [self._read(folder, system, robot) for robot, folder in enumerate(folders)])
 
-    def _read(self, folder: Path, system: System, *, judged: bool = True) -> Recording:
-        runs = {file: read_runs(file, system, self.columns) for file in list_logs(folder)}
-        _tell_duplicates([(file, x) for file, its in runs.items() for x, _ in its])
-        notes: dict[str, float] = {}
-        if judged:
-            ratios = [judge(system, *of_one_length(its), str(file), self.allow_mismatch) for file, its in runs.items()]
-            notes = {"recording_residual": max(ratios)}
-        states, inputs = of_one_length([run for its in runs.values() for run in its])
+    def _read(self, folder: Path, system: System, robot: int | None = None) -> Recording:
+        files = {file: read_runs(file, system, self.columns) for file in list_logs(folder)}
+        runs = [run for its in files.values() for run in its]
+        _tell_duplicates([(file, x) for file, its in files.items() for x, _ in its])
+        plant = plant_of(system, runs, robot)
+        if plant.learned:
+            tell_shifted(runs, str(folder))
+        elif self.offset == "estimated":
+            plant = tell_offset(plant, runs, str(folder))
+        ratios = [judge_runs(plant, its, str(file), self.allow_mismatch) for file, its in files.items()]
+        notes: dict[str, float] = {"recording_residual": max(ratios)}
+        states, inputs = side_by_side(runs)
+        notes["inputs_held"] = tell_held([u for _, u in runs], str(folder))
         if not self.allow_mismatch:
             notes["excitation_condition"] = check_excited(inputs, system.state_dim + 1, str(folder))
         return Recording(states, inputs, notes)
+
+
+def _together(folders: Sequence[Path], recordings: Sequence[Recording]) -> Recording:
+    """The recordings of a fleet; the worst of what is noted of any.
+
+    Raises:
+        DataError: if a robot has another number or length of recordings than the first one.
+    """
+    first = recordings[0]
+    for folder, recording in zip(folders, recordings, strict=True):
+        if recording.inputs.shape != first.inputs.shape or np.isnan(recording.states).any():
+            raise DataError(
+                f"{folder}: holds {recording.count} recordings with S = {recording.length}, {folders[0].name} "
+                f"{first.count} with {first.length}; cut to equal number and S"
+            )
+    notes = {name: max(recording.notes[name] for recording in recordings) for name in first.notes}
+    return Recording(np.stack([r.states for r in recordings]), np.stack([r.inputs for r in recordings]), notes)
 
 
 def _tell_duplicates(runs: Sequence[tuple[Path, np.ndarray]]) -> None:

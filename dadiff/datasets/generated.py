@@ -8,7 +8,7 @@ from typing import Any, Literal, Protocol, get_args, runtime_checkable
 
 from dadiff.errors import ConfigError, NotApplicableError
 from dadiff.randomness import numpy_generator
-from dadiff.systems import Family, System
+from dadiff.systems import Family, System, Unknown
 from dadiff.tasks import Cases, Demonstrations, Task
 from dadiff.tasks.task import Continuing, Stretching
 
@@ -72,6 +72,7 @@ class Generated:
         Raises:
             NotApplicableError: if they should begin along trajectories, and the task knows of no such thing.
         """
+        _check_known(system)
         rng = numpy_generator(self.seed, "demonstrations")
         if self.start_states == "drawn":
             return task.demonstrations(system, self.train_size, rng)
@@ -87,6 +88,7 @@ class Generated:
         Raises:
             NotApplicableError: if their ranges are to be stretched, and the task has none.
         """
+        _check_known(system)
         if self.test_ranges != 1:
             task = self._stretched(task)
         return task.cases(system, self.test_size, numpy_generator(self.seed, "cases"))
@@ -97,3 +99,8 @@ class Generated:
                 f"dataset: test_ranges is {self.test_ranges:g}, but {type(task).__name__} has no `stretched`; use 1"
             )
         return task.stretched(self.test_ranges)
+
+
+def _check_known(system: System | Family) -> None:
+    if isinstance(system, Unknown):
+        raise NotApplicableError("dataset: no expert knows a system that is unknown; use dataset=npz for your own data")

@@ -65,7 +65,9 @@ def spread(planned: np.ndarray, covariance_trace: float | None = None) -> Scores
     )
 
 
-def violations(system: System, layout: TrajectoryLayout, planned: np.ndarray, rollout: np.ndarray) -> Scores:
+def violations(
+    system: System, layout: TrajectoryLayout, planned: np.ndarray, rollout: np.ndarray | None = None
+) -> Scores:
     """By how much plans exceed the system's bounds, where it has any.
 
     `violation` is a plan's largest, in the units of what is exceeded, `violating` whether it is more than VIOLATION;
@@ -73,9 +75,10 @@ def violations(system: System, layout: TrajectoryLayout, planned: np.ndarray, ro
     """
     if not system.bounds.any:
         return Scores()
-    violation, replayed = (_beyond(system, layout, tau) for tau in (planned, rollout))
-    violating = (violation > VIOLATION).astype(float)
-    per_plan = {"violation": violation, "violating": violating, "rollout_violation": replayed}
+    violation = _beyond(system, layout, planned)
+    per_plan = {"violation": violation, "violating": (violation > VIOLATION).astype(float)}
+    if rollout is not None:
+        per_plan["rollout_violation"] = _beyond(system, layout, rollout)
     return Scores(per_plan=per_plan, headline={"largest_violation": float(violation.max())})
 
 
@@ -87,6 +90,19 @@ def _beyond(system: System, layout: TrajectoryLayout, tau: np.ndarray) -> np.nda
     return np.maximum(np.maximum(*exceeded), 0.0)
 
 
+def planned_errors(layout: TrajectoryLayout, cases: Cases, planned: np.ndarray) -> Scores:
+    """State and input errors as planned: all that can be said where the system is unknown."""
+    x, u = layout.split(planned)
+    x_ref, u_ref = (part[..., None, :, :] for part in layout.split(cases.reference))
+    return Scores(
+        per_step={
+            "planned_state_error": _squared(x - x_ref),
+            "planned_input_error": _to_horizon(_squared(u - u_ref)),
+        },
+        per_plan={"initial_state_error": _squared(x[..., 0, :] - cases.x_init[..., None, :])},
+    )
+
+
 def tracking_errors(
     system: System, layout: TrajectoryLayout, cases: Cases, planned: np.ndarray, rollout: np.ndarray
 ) -> Scores:
@@ -94,20 +110,18 @@ def tracking_errors(
 
     `gap_nrmse` is the gap of a plan, each state over its deviation in the robot's references, as a root mean square.
     """
-    x, u = layout.split(planned)
-    x_replayed = layout.states(rollout)
-    x_ref, u_ref = (part[..., None, :, :] for part in layout.split(cases.reference))
-    singular = system.singular(x_replayed)
+    x, x_replayed = layout.states(planned), layout.states(rollout)
+    x_ref = layout.states(cases.reference)[..., None, :, :]
+    singular, errors = system.singular(x_replayed), planned_errors(layout, cases, planned)
     return Scores(
         per_step={
-            "planned_state_error": _squared(x - x_ref),
-            "planned_input_error": _to_horizon(_squared(u - u_ref)),
+            **errors.per_step,
             "rollout_state_error": _squared(x_replayed - x_ref),
             "gap": _squared(x - x_replayed),
             "dynamics_residual": _to_horizon(dynamics_residual(system, layout, planned)),
         },
         per_plan={
-            "initial_state_error": _squared(x[..., 0, :] - cases.x_init[..., None, :]),
+            **errors.per_plan,
             "gap_nrmse": _normalised(x - x_replayed, layout.states(cases.reference)),
             **({} if singular is None else {"singular_steps": singular.astype(float)}),
         },

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from dadiff.outside import spreadsheet_safe
@@ -12,6 +12,7 @@ from dadiff.reporting.aggregation import LEVELS, Evidence, Method, has_metric, p
 from dadiff.reporting.labels import FLOORS, METRICS, method_name
 from dadiff.reporting.selection import Selector
 from dadiff.reporting.statistics import Estimate, difference, mean, ratio
+from dadiff.store.record import ABOUT_DATA, is_odd
 
 
 @dataclass(frozen=True)
@@ -36,11 +37,12 @@ class Row:
 
 @dataclass(frozen=True)
 class Table:
-    """Rows and the order of the metrics; `baseline` names what ratios are relative to."""
+    """Rows and the order of the metrics; `baseline` names what ratios are relative to, `odd` what is odd about data."""
 
     metrics: list[str]
     baseline: str
     rows: list[Row]
+    odd: list[str] = field(default_factory=list)
 
     @property
     def runs(self) -> list[str]:
@@ -49,8 +51,8 @@ class Table:
 
     @property
     def notes(self) -> list[str]:
-        """What became of cells without results."""
-        return [f"{row.label}: {row.outcome}" for row in self.rows if row.outcome]
+        """What became of cells without results, and what is odd about data from files."""
+        return [f"{row.label}: {row.outcome}" for row in self.rows if row.outcome] + self.odd
 
 
 def collect(
@@ -61,7 +63,8 @@ def collect(
     relative_to: Selector | None = None,
     group: str | None = None,
 ) -> Table:
-    """The methods that `cells` asks for; metrics that none of them has are left out.
+    """The methods that `cells` asks for; metrics that none of them has are left out, those about data from files stand
+    in every table.
 
     Args:
         metrics: `...` stands for all scores of the task that have no name in print, those of own tasks.
@@ -70,9 +73,20 @@ def collect(
     """
     methods = evidence.methods(cells)
     metrics = [name for asked in metrics for name in (_own(methods) if asked == "..." else [asked])]
-    kept = [name for name in metrics if any(m.finished and has_metric(m.finished, name) for m in methods)]
+    wanted = dict.fromkeys([*metrics, *ABOUT_DATA])
+    kept = [name for name in wanted if any(m.finished and has_metric(m.finished, name) for m in methods)]
     rows = [_row(evidence, method, kept, varying(methods), relative_to, group) for method in methods]
-    return Table(kept, method_name(dict(relative_to)) if relative_to else "", rows)
+    return Table(kept, method_name(dict(relative_to)) if relative_to else "", rows, _odd(methods))
+
+
+def _odd(methods: list[Method]) -> list[str]:
+    """What the worst run of each method says about its data, where that is odd."""
+    found = []
+    for method in methods:
+        for metric, words in ABOUT_DATA.items():
+            values = [cell.metrics[metric] for cell in method.finished if is_odd(metric, cell.metrics)]
+            found += [f"{method_name(method.axes, varying(methods))}: {words.format(max(values))}"] if values else []
+    return found
 
 
 def _own(methods: list[Method]) -> list[str]:

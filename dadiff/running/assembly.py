@@ -14,12 +14,14 @@ from dadiff.behaviours import TrajectorySet, starts_fixed
 from dadiff.datasets.cached import load_data, save_data
 from dadiff.denoisers.recipes import ExactRecipe, Recipe
 from dadiff.diffusion.estimate import Estimate
-from dadiff.errors import ConfigError
+from dadiff.errors import ConfigError, NotApplicableError
+from dadiff.evaluation import ClosedLoop, Exact
 from dadiff.experts.lqr import GaussianLaw
+from dadiff.running.data import told_of_data
 from dadiff.running.identity import SHARED, Artefact, Identity, Shared, identity_of
 from dadiff.running.parts import Parts
 from dadiff.store import Cache, Results
-from dadiff.systems import Recording, Robots, System
+from dadiff.systems import Recording, Robots, System, Unknown
 from dadiff.tasks import Cases, Demonstrations
 from dadiff.tasks.encodings import Encoder
 from dadiff.tasks.task import Augmenting, Lawful
@@ -76,6 +78,10 @@ class Experiment:
             raise ConfigError(
                 "task: it plans for one system, and the chosen system is a family of robots; "
                 "use task=fleet, or a single system such as system=double_integrator"
+            )
+        if isinstance(target, Unknown) and isinstance(self.parts.evaluation, ClosedLoop | Exact):
+            raise NotApplicableError(
+                "evaluation: episodes and exact laws need the system, which is unknown; use evaluation=default"
             )
         return target
 
@@ -158,6 +164,11 @@ class Experiment:
         return self.parts.projector.fit(self.layout, system=self.target, **self.sources)
 
     @cached_property
+    def told_of_data(self) -> dict[str, float]:
+        """What is to be known of data from files, see `dadiff.running.data`."""
+        return told_of_data(self)
+
+    @cached_property
     def sources(self) -> dict[str, Any]:
         """What the projector learns from, besides the system."""
         needs, sources = self.parts.projector.needs, dict[str, Any]()
@@ -172,7 +183,7 @@ class Experiment:
         """All of it as one thing that plans."""
         from dadiff.planning import Planner
 
-        behaviour = self.behaviour  # before the denoiser is trained, since it may refuse what it is given
+        behaviour, _ = self.behaviour, self.told_of_data  # before training: they may refuse what they are given
         return Planner(
             self.parts.task,
             self.target,
@@ -222,6 +233,10 @@ class Experiment:
             ConfigError: if the task's law is not Gaussian.
         """
         task, recipe = self.parts.task, self.parts.denoiser
+        if isinstance(self.target, Unknown) and not (isinstance(recipe, ExactRecipe) and recipe.matched):
+            raise NotApplicableError(
+                "denoiser: the exact denoiser needs the system, which is unknown; use denoiser=moment_matched or mlp"
+            )
         if isinstance(recipe, ExactRecipe) and recipe.matched:
             return GaussianLaw.of_demonstrations(self.demonstrations.trajectories, self.demonstrations.environment)
         if not isinstance(task, Lawful):
@@ -234,7 +249,7 @@ class Experiment:
     @property
     def covariance_trace(self) -> float | None:
         """Of the law of demonstrations given E, averaged over robots; None where the law is not known."""
-        if not isinstance(self.parts.task, Lawful):
+        if not isinstance(self.parts.task, Lawful) or isinstance(self.target, Unknown):
             return None
         return float(np.square(self.law.noise_map).sum(axis=(-2, -1)).mean())
 

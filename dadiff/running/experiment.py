@@ -19,7 +19,7 @@ from dadiff.behaviours import Known, Nominal, compared, model_of, pins, predicti
 from dadiff.diffusion.chain import Samples
 from dadiff.diffusion.enforcement import PostHoc
 from dadiff.errors import NotApplicableError
-from dadiff.evaluation import ClosedLoop, Exact, replay, spread, tracking_errors, violations
+from dadiff.evaluation import ClosedLoop, Exact, planned_errors, replay, spread, tracking_errors, violations
 from dadiff.evaluation.closed_loop import Bench, latencies, means
 from dadiff.evaluation.mahalanobis import MahalanobisDistance
 from dadiff.evaluation.records import ChainRecorder, Snapshots, headline, merged, tables
@@ -31,7 +31,7 @@ from dadiff.randomness import numpy_generator, torch_generator
 from dadiff.running.assembly import Experiment
 from dadiff.running.provenance import record_of
 from dadiff.store import StoredRun
-from dadiff.systems import Robots, System, TimeVarying
+from dadiff.systems import Robots, System, TimeVarying, Unknown
 from dadiff.tasks import Scores
 from dadiff.tasks.task import Steering
 from dadiff.trajectory import TrajectoryLayout
@@ -121,7 +121,8 @@ def measured_projection(experiment: Experiment, environment: np.ndarray) -> tupl
     measures = {"projector_setup_seconds": fitted + bind.seconds, **behaviour.notes}
     if "recording" in experiment.sources:
         measures |= experiment.sources["recording"].notes
-    if experiment.sources or isinstance(experiment.parts.projector, Nominal):
+    known = not isinstance(experiment.target, Unknown)
+    if known and (experiment.sources or isinstance(experiment.parts.projector, Nominal)):
         held = pins(experiment.parts.projector, experiment.layout, experiment.condition.get(environment, "x_init"))
         measures |= compared(behaviour, Known().fit(experiment.layout, experiment.target), held)
         measures |= prediction_error(behaviour, experiment.target, experiment.cases.reference)
@@ -173,7 +174,7 @@ def _store(experiment: Experiment, plans: Plans, started: float) -> StoredRun:
     if diverged_at is None:
         scores = evaluate(experiment, plans.planned)
         written |= tables(scores)
-        metrics = headline(scores) | metrics | latency(experiment)
+        metrics = headline(scores) | metrics | experiment.told_of_data | latency(experiment)
         if isinstance(experiment.parts.evaluation, ClosedLoop):
             episodes = Bench(experiment.planner, experiment.cases, experiment.parts.evaluation).table()
             written["closed_loop"] = episodes
@@ -203,6 +204,9 @@ def _store(experiment: Experiment, plans: Plans, started: float) -> StoredRun:
 def evaluate(experiment: Experiment, planned: np.ndarray) -> Scores:
     """What can be said of plans (*robots, cases, samples, d): errors along time, and the task's own scores."""
     system, layout, cases = experiment.target, experiment.layout, experiment.cases
+    if isinstance(system, Unknown):  # what becomes of plans is not known: only what they are is scored
+        told = planned_errors(layout, cases, planned), spread(planned), violations(system, layout, planned)
+        return merged(*told)
     rollout = replay(system, layout, planned, cases.x_init)
     return merged(
         tracking_errors(system, layout, cases, planned, rollout),
@@ -267,7 +271,7 @@ def examples(experiment: Experiment, plans: Plans) -> dict[str, np.ndarray]:
     states, inputs = layout.split(planned)
     reference_states, reference_inputs = layout.split(reference)
     noised = _noised(experiment, cases.reference[(*plans.snapshots.plan[:-1], 0)], steps)
-    rollout = layout.states(replay(system, layout, planned, E["x_init"]))
+    rollout = _replayed(system, layout, planned, E["x_init"])
     return {
         "states": states,
         "inputs": inputs,
@@ -288,6 +292,13 @@ def _outlines(system: System, rollout: np.ndarray) -> dict[str, np.ndarray]:
     """`outlines` of the robot along rollout_states (..., T+1, n), if it is more than a point."""
     found = system.outline(rollout)
     return {"outlines": found} if found.shape[-2] > 1 else {}
+
+
+def _replayed(system: System, layout: TrajectoryLayout, planned: np.ndarray, x_init: np.ndarray) -> np.ndarray:
+    """States after replay; nan where the system is unknown."""
+    if isinstance(system, Unknown):
+        return np.full_like(layout.states(planned), np.nan)
+    return layout.states(replay(system, layout, planned, x_init))
 
 
 def _named(layout: TrajectoryLayout) -> dict[str, np.ndarray]:

@@ -10,6 +10,7 @@ from rich.table import Table
 
 from dadiff.store import StoredRun
 from dadiff.store.names import differences
+from dadiff.store.record import ABOUT_DATA, is_odd
 from dadiff.terminal import plain_table, text
 
 METRICS = {
@@ -23,7 +24,14 @@ METRICS = {
     "calls": "network_calls",
     "seconds": "sampling_seconds",
     "seconds for one plan": "plan_latency",
+    "recording / noise": "recording_residual",
+    "demonstrations / noise": "demonstrations_residual",
+    "test cases / noise": "cases_residual",
+    "test cases in train": "also_in_train",
+    "test cases far outside": "outside_training",
 }
+ODD = [title for title, metric in METRICS.items() if metric in ABOUT_DATA]
+"""Of these several runs show what says that data are odd: residuals are 1 in good data, counts 0."""
 COLUMNS = ("cost ratio", "state error", "replayed", "plan-replay gap", "seconds")
 """Of several runs, which are sorted by the first of these that they have."""
 MOST_ROWS = 30
@@ -45,7 +53,8 @@ def several_runs(runs: Sequence[StoredRun]) -> str:
     """One row a run, called by what is not the same in all of them; runs without numbers come last."""
     if not runs:
         return ""
-    titles = _fitting([title for title in COLUMNS if any(METRICS[title] in run.metrics for run in runs)])
+    odd = [title for title in ODD if any(is_odd(METRICS[title], run.metrics) for run in runs)]
+    titles = _fitting([title for title in COLUMNS if any(METRICS[title] in run.metrics for run in runs)]) + odd
     table = plain_table("run", *titles)
     for column in table.columns[1:]:
         column.justify = "right"

@@ -84,6 +84,24 @@ class Record:
         return asdict(self)
 
 
+MOST_RESIDUAL = 1.5
+"""Of data from files over the noise: what obeys the system has 1."""
+
+ABOUT_DATA = {
+    "recording_residual": "the recording's steps are {:.3g} times their noise off the system's",
+    "demonstrations_residual": "the demonstrations' steps are {:.3g} times their noise off the system's",
+    "cases_residual": "the test cases' steps are {:.3g} times their noise off the system's",
+    "also_in_train": "{:.0f} test cases are also in train",
+    "outside_training": "{:.0f} test cases lie far outside of what was learned from",
+}
+"""Metrics that say whether data can be trusted, and what they say where they are odd."""
+
+
+def is_odd(metric: str, metrics: Mapping[str, float]) -> bool:
+    """Whether a run's data are odd by one of `ABOUT_DATA`: residuals should be 1, counts 0."""
+    return metrics.get(metric, 0) > (MOST_RESIDUAL if metric.endswith("_residual") else 0)
+
+
 def read_record(path: Path) -> Record:
     """The record in a file; fields that this version does not know are left aside.
 

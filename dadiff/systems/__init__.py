@@ -9,6 +9,7 @@ from dadiff.systems.nonlinear import Continuous, Nonlinear, Simulated
 from dadiff.systems.quadrotors import PlanarQuadrotor, PlanarQuadrotors
 from dadiff.systems.recording import FeedbackExcitation, GaussianExcitation, Recording
 from dadiff.systems.system import Bounds, System
+from dadiff.systems.unknown import Unknown, unknown
 
 __all__ = [
     "AffineSystem",
@@ -31,9 +32,11 @@ __all__ = [
     "Simulated",
     "System",
     "TimeVarying",
+    "Unknown",
     "double_integrator",
     "from_control",
     "inline",
     "mujoco_robot",
     "require_affine",
+    "unknown",
 ]

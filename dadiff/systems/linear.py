@@ -11,8 +11,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from dadiff.errors import ConfigError, ShapeError
+from dadiff.errors import ConfigError, NotApplicableError, ShapeError
 from dadiff.systems.system import System, Times, robots_of
+from dadiff.systems.unknown import LEARNED, Unknown
 from dadiff.trajectory.response import along, beside, simulate, trajectory_map
 
 
@@ -205,7 +206,10 @@ def require_affine(system: object, what: str) -> AffineSystem:
 
     Raises:
         ConfigError: if it is any other.
+        NotApplicableError: if it is unknown.
     """
+    if isinstance(system, Unknown):
+        raise NotApplicableError(f"{what} needs the system, which is unknown; {LEARNED}")
     if not isinstance(system, AffineSystem):
         raise ConfigError(
             f"{what} needs a linear system, found {type(system).__name__}; use one that is Linear or TimeVarying"

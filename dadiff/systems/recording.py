@@ -19,7 +19,7 @@ from dadiff.trajectory.response import along
 
 @dataclass(frozen=True)
 class Recording:
-    """One or several experiments of S inputs each.
+    """One or several experiments of S inputs each, or of at most S where they differ: nan stands after their end.
 
     Args:
         states: (*robots, count, S+1, n).
@@ -38,13 +38,19 @@ class Recording:
 
     @property
     def length(self) -> int:
-        """S, the number of inputs."""
+        """S, the number of inputs; of several experiments, those of the longest."""
         return self.inputs.shape[-2]
 
     @property
     def count(self) -> int:
         """Number of experiments."""
         return self.inputs.shape[-3]
+
+    @property
+    def runs(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """States (S+1, n) and inputs (S, m) of each experiment of a single system, as long as it is."""
+        lengths = np.isfinite(self.inputs).all(axis=-1).sum(axis=-1)
+        return [(x[: S + 1], u[:S]) for x, u, S in zip(self.states, self.inputs, lengths, strict=True)]
 
 
 class Recorder(Protocol):

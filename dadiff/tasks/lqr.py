@@ -17,7 +17,7 @@ from dadiff.experts.lqr import (
     optimal_feedback,
     stationary_feedback,
 )
-from dadiff.systems import AffineSystem, Family, TimeVarying, require_affine
+from dadiff.systems import AffineSystem, Family, TimeVarying, Unknown, require_affine
 from dadiff.tasks.quadratic import (
     QuadraticCost,
     Range,
@@ -101,12 +101,12 @@ class LQR:
         )
 
     def target(self, system: AffineSystem) -> AffineSystem:
-        """The system itself.
+        """The system itself; an unknown one has no expert, and demonstrations of one's own.
 
         Raises:
             ConfigError: if it is not linear.
         """
-        if isinstance(system, Family):  # of which the caller says that it needs another task
+        if isinstance(system, Family | Unknown):  # of a family the caller says that it needs another task
             return system
         return require_affine(system, "task: the LQR expert")
 

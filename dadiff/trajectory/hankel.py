@@ -32,7 +32,8 @@ def trajectory_matrix(states: np.ndarray, inputs: np.ndarray, layout: Trajectory
     """H = [H_{T+1}(x); H_T(u)] of shape (*robots, d, count (S - T + 1)), eq. (10).
 
     Args:
-        states: (*robots, count, S+1, n); the windows of several recordings stand side by side.
+        states: (*robots, count, S+1, n), nan after the end of one that is shorter; the windows of several recordings
+            stand side by side.
         inputs: (*robots, count, S, m).
         spare: columns that are needed beside n + mT: one where an offset is estimated from them, too.
 
@@ -40,12 +41,19 @@ def trajectory_matrix(states: np.ndarray, inputs: np.ndarray, layout: Trajectory
         ExcitationError: if there are fewer than n + mT columns, and those that are spare.
     """
     count, length = inputs.shape[-3], inputs.shape[-2]
-    if count * (length - layout.horizon + 1) < layout.rank + spare:
-        found = count * max(0, length - layout.horizon + 1)
+    columns = _whole(layout, states, inputs) if length >= layout.horizon else np.empty((0, layout.size))
+    if (found := columns.shape[-2]) < layout.rank + spare:
         needed = f"n + mT{f' + {spare}' if spare else ''} = {layout.rank + spare}"
         raise ExcitationError(
             f"recording: S = {length} is too short: {count} x {length} inputs give {found} windows of "
             f"T = {layout.horizon}; {needed} are needed: record S >= {minimum_length(layout, count, spare)}"
         )
-    columns = layout.flatten(windows(states, layout.horizon + 1), windows(inputs, layout.horizon))
-    return columns.reshape(*columns.shape[:-3], -1, layout.size).swapaxes(-1, -2)
+    return columns.swapaxes(-1, -2)
+
+
+def _whole(layout: TrajectoryLayout, states: np.ndarray, inputs: np.ndarray) -> np.ndarray:
+    """The windows (*robots, columns, d) that do not reach beyond the end of their recording."""
+    made = layout.flatten(windows(states, layout.horizon + 1), windows(inputs, layout.horizon))
+    columns = made.reshape(*made.shape[:-3], -1, layout.size)
+    ended = np.isnan(columns).any(axis=-1)
+    return columns[~ended] if ended.ndim == 1 and ended.any() else columns
