@@ -16,6 +16,7 @@ from dadiff.diffusion.conditional import Conditional
 from dadiff.diffusion.context import Context, Counted, unprojected
 from dadiff.diffusion.enforcement import CleanEstimate, Convex, Literally, Never, Normalised, PostHoc
 from dadiff.diffusion.estimate import Estimate
+from dadiff.diffusion.limiting import Barrier, QPFilter
 from dadiff.diffusion.rivals import DPS, MCG, PPR, TMPD, PiGDM, Replacement, RolloutBlend
 from dadiff.diffusion.samplers import DDIM, DDPM, Step
 from dadiff.diffusion.schedule import Schedule, cosine, ddpm_linear, paper_linear
@@ -29,7 +30,8 @@ LAYOUT = SYSTEM.layout(HORIZON)
 ENFORCEMENTS = variants("enforcement", {"acts_on": ("sample", "clean_estimate")})
 OWN_NOISE = (Replacement, MCG, PPR)
 OFF_THE_SET = (Never, PiGDM, DPS, RolloutBlend, TMPD)  # what comes out may lie anywhere; see test_rivals.py
-STABLE = {name: e for name, e in ENFORCEMENTS.items() if not isinstance(e, Literally)}
+ABOUT_BOUNDS = (QPFilter, Barrier)  # see test_limiting.py
+STABLE = {name: e for name, e in ENFORCEMENTS.items() if not isinstance(e, (Literally, *ABOUT_BOUNDS))}
 # How often each calls P in a chain of that many steps and network calls; a new enforcement is a new row.
 CALLS = {
     Never(): lambda steps, calls: 0,

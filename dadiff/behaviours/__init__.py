@@ -3,10 +3,19 @@
 from dadiff.behaviours.doubt import Doubted
 from dadiff.behaviours.family import IdentifiedFamily
 from dadiff.behaviours.identified import Identified, IdentifiedSoft, Koopman
-from dadiff.behaviours.known import Inpainting, Known, KnownClear, Nominal, NoProjector, RolloutProjector
+from dadiff.behaviours.known import (
+    Inpainting,
+    Known,
+    KnownClear,
+    KnownClipped,
+    KnownTightened,
+    Nominal,
+    NoProjector,
+    RolloutProjector,
+)
 from dadiff.behaviours.least_squares import Estimate, Transitions, least_squares
 from dadiff.behaviours.lifted import Lifted
-from dadiff.behaviours.limited import Limited
+from dadiff.behaviours.limited import Clipped, Limited
 from dadiff.behaviours.manifold import Manifold
 from dadiff.behaviours.pins import Pin
 from dadiff.behaviours.prediction import model_of, prediction_error
@@ -17,6 +26,7 @@ from dadiff.behaviours.stages import Stages
 from dadiff.behaviours.windows import Hankel, HankelLowRank
 
 __all__ = [
+    "Clipped",
     "Doubted",
     "Dynamics",
     "Estimate",
@@ -30,6 +40,8 @@ __all__ = [
     "Inpainting",
     "Known",
     "KnownClear",
+    "KnownClipped",
+    "KnownTightened",
     "Koopman",
     "Lifted",
     "Limited",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
-from dadiff.behaviours.limited import Limited
+from dadiff.behaviours.limited import Clipped, Limited
 from dadiff.behaviours.manifold import Manifold
 from dadiff.behaviours.projector import NOTHING, SYSTEM, Fitted, Sources
 from dadiff.behaviours.sets import Dynamics, Everything, InitialState, Rollout
@@ -94,6 +94,49 @@ class Nominal(Known):
                 "projector nominal: the system is of no family whose middle could be taken for it; use projector=known"
             )
         return super().find(layout, replace(sources, given_system=system.nominal))
+
+
+@dataclass(frozen=True)
+class KnownTightened(Known):
+    """`Known` within bounds that are tightened, as a margin for what the plan does not know (Chisci et al. 2001).
+
+    Diffusion predictive control with constraints does so (Römer et al. 2024).
+
+    Args:
+        tightening: the share of half their distance by which bounds move towards each other.
+    """
+
+    label: ClassVar[str] = "known_tightened"
+    bounds: BoundsChoice = "enforced"
+    tightening: float = 0.1
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0 <= self.tightening < 1:
+            raise ConfigError(f"projector: tightening is {self.tightening}; it must lie in [0, 1)")
+
+    def find(self, layout: TrajectoryLayout, sources: Sources) -> Dynamics | Manifold | Limited:
+        """The trajectories of the system within tightened bounds."""
+        found = super().find(layout, sources)
+        return replace(found, bounds=found.bounds.tightened(self.tightening)) if isinstance(found, Limited) else found
+
+
+@dataclass(frozen=True)
+class KnownClipped(Known):
+    """`Known` dynamics, without regard to bounds; then plans are clipped.
+
+    Args:
+        replay: clip inputs only, and recompute the states.
+    """
+
+    label: ClassVar[str] = "known_clipped"
+    bounds: BoundsChoice = "enforced"
+    replay: bool = False
+
+    def find(self, layout: TrajectoryLayout, sources: Sources) -> Dynamics | Manifold | Limited:
+        """The trajectories of the system, clipped."""
+        found = super().find(layout, sources)
+        return Clipped(found.dynamics, found.bounds, replay=self.replay) if isinstance(found, Limited) else found
 
 
 @dataclass(frozen=True)

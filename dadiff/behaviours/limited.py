@@ -19,8 +19,8 @@ from dadiff.behaviours.pins import Pin, Pinned
 from dadiff.behaviours.projection import Projection, ProjectionInfo, check_shape
 from dadiff.behaviours.sets import Dynamics
 from dadiff.errors import NotApplicableError
-from dadiff.experts.limited_ilqr import LimitedTracking, solve
-from dadiff.experts.nearest import Limits, Status, nearest
+from dadiff.experts.limited_ilqr import MISSED, LimitedTracking, solve
+from dadiff.experts.nearest import Limits, Status, nearest, within
 from dadiff.systems.system import Bounds
 from dadiff.trajectory.arrays import Array
 from dadiff.trajectory.coordinates import Coordinates, physical
@@ -127,6 +127,18 @@ class LimitedProjection(Projection):
     def _nearest(self, aim: np.ndarray, scale: np.ndarray, start: np.ndarray | None) -> np.ndarray:
         """Within limits, nearest to aim (*robots, plans, d) with distances in units of scale."""
 
+    @property
+    def unlimited(self) -> Projection:
+        """The projection onto the dynamics alone."""
+        return self._unlimited
+
+    @property
+    def box(self) -> tuple[np.ndarray, np.ndarray]:
+        """(low, high) of plans, each (d,), in the coordinates that the set was bound in; pins have none."""
+        low, high = (bound.copy() for bound in within(self._set.layout, self._set.bounds))
+        low[self._pinned.places], high[self._pinned.places] = -np.inf, np.inf
+        return self._where.to_scaled(low), self._where.to_scaled(high)
+
     def on(self, device: str) -> LimitedProjection:
         """Itself: it has nothing to move."""
         return self
@@ -192,6 +204,41 @@ class AlongManifold(LimitedProjection):
             tau, count = solution.tau, count + int(solution.sweeps.max(initial=0))
         self._observe(problem.exceeded(tau), problem.within(tau), count)
         return tau
+
+
+@dataclass(frozen=True)
+class Clipped(Limited):
+    """What robots do about bounds that nobody thought of: plans of the dynamics whose entries are clipped.
+
+    Args:
+        replay: clip inputs only, and recompute the states, which may then exceed their bounds.
+    """
+
+    replay: bool = field(default=False, kw_only=True)
+
+    def bind(
+        self, coordinates: Coordinates | None = None, pins: Sequence[Pin] = (), device: str | None = None
+    ) -> Projection:
+        """The map onto the dynamics and then between the bounds; it is no projection."""
+        return ClippedProjection(self, coordinates or physical(self.layout), pins)
+
+
+class ClippedProjection(LimitedProjection):
+    """See `Clipped`."""
+
+    def _nearest(self, aim: np.ndarray, scale: np.ndarray, start: np.ndarray | None) -> np.ndarray:
+        target, where = cast(Clipped, self._set), self._where
+        layout, limits = target.layout, self._limits(aim.shape[:-1])
+        begin = None if start is None else where.to_scaled(start)
+        tau = where.to_physical(self._unlimited(where.to_scaled(aim), None, begin))
+        clipped = limits.clip(tau.reshape(-1, layout.size)).reshape(tau.shape)
+        if target.replay:
+            dynamics, inputs = target.dynamics, layout.inputs(clipped)
+            by = dynamics.stages if isinstance(dynamics, Dynamics) else dynamics.system
+            clipped = layout.flatten(by.simulate(layout.states(clipped)[..., 0, :], inputs), inputs)
+        exceeded = limits.exceeded(layout, clipped.reshape(-1, layout.size))
+        self._observe(exceeded, exceeded <= MISSED * (1 + np.abs(clipped).max()), 1)
+        return clipped
 
 
 def _deviations(metric: Covariance | None) -> np.ndarray:

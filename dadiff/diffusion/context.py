@@ -6,6 +6,8 @@ from collections.abc import Callable, MutableMapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
 
+import numpy as np
+
 from dadiff.diffusion.estimate import Estimate
 from dadiff.diffusion.samplers import Step
 from dadiff.diffusion.schedule import Schedule
@@ -29,6 +31,21 @@ class Project(Protocol):
         noise: Array | None = None,
     ) -> Array:
         """The admissible trajectory that is nearest to tau, in the metric of a covariance."""
+        ...
+
+
+@runtime_checkable
+class Limiting(Protocol):
+    """A projection onto dynamics within limits; see `dadiff.behaviours.Limited`."""
+
+    @property
+    def unlimited(self) -> Project:
+        """The projection onto the dynamics alone."""
+        ...
+
+    @property
+    def box(self) -> tuple[np.ndarray, np.ndarray]:
+        """(low, high) of plans, each (d,), in the sampler's coordinates."""
         ...
 
 
@@ -124,6 +141,19 @@ class Context:
                 "an Estimate (dadiff.diffusion.estimate), or use another enforcement"
             )
         return self.estimate
+
+    def limiting(self) -> Limiting:
+        """P, which keeps to limits.
+
+        Raises:
+            NotApplicableError: if it keeps to none.
+        """
+        if not isinstance(self.project, Limiting):
+            raise NotApplicableError(
+                "enforcement: it is about bounds, and this projector keeps to none; use projector=known_bounded, and "
+                "give the system bounds"
+            )
+        return self.project
 
     def onto(self, tau: Array, metric: Covariance | None = None, noise: Array | None = None) -> Array:
         """P of a clean estimate, begun at the last one, where P is iterated."""

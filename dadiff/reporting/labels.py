@@ -17,6 +17,10 @@ PROJECTORS = {
     "identified_soft": "identified, trusted by direction",
     "identified_family": "identified within its family",
     "known_bounded": "known, within bounds",
+    "known_tightened": "known, within tightened bounds",
+    "known_clipped": "known, then clipped",
+    "known_clipped_replayed": "known, then clipped and replayed",
+    "known_clear": "known, clear of discs",
     "inpainting": "x(0) alone",
     "rollout": "roll-out",
 }
@@ -28,6 +32,9 @@ ENFORCEMENTS = {
     "convex": "convex",
     "clean_estimate": "on the clean estimate",
     "conditional": "conditional",
+    "qp_filter": "conditional, bounds once at the end",
+    "barrier": "conditional, barrier filter",
+    "constricting_tube": "conditional, constricting tube",
     "literal": "as printed",
 }
 WORDS: dict[str, dict[str, str]] = {

@@ -8,6 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ import yaml
 
 from dadiff.behaviours import Known, Nominal, compared, model_of, pins, prediction_error
 from dadiff.diffusion.chain import Samples
+from dadiff.diffusion.context import Limiting
 from dadiff.diffusion.enforcement import PostHoc
 from dadiff.errors import NotApplicableError
 from dadiff.evaluation import ClosedLoop, Exact, planned_errors, replay, spread, tracking_errors, violations
@@ -51,9 +53,13 @@ class Timed:
 
     def __call__(self, *arguments: Any, **options: Any) -> Any:
         """Call it."""
+        return self.timed(self.function, *arguments, **options)
+
+    def timed(self, function: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
+        """Call another function on the same account."""
         self._wait()
         start = time.perf_counter()
-        result = self.function(*arguments, **options)
+        result = function(*arguments, **options)
         self._wait()
         self.seconds += time.perf_counter() - start
         self.calls += 1
@@ -62,6 +68,20 @@ class Timed:
     def _wait(self) -> None:
         if self.device != "cpu":
             torch.cuda.synchronize(self.device)
+
+
+class TimedWithinLimits(Timed):
+    """A projection that keeps to limits, and is asked without them, too."""
+
+    @property
+    def unlimited(self) -> Callable[..., Any]:
+        """See `dadiff.diffusion.context.Limiting`."""
+        return partial(self.timed, self.function.unlimited)  # type: ignore[attr-defined]
+
+    @property
+    def box(self) -> tuple[np.ndarray, np.ndarray]:
+        """See `dadiff.diffusion.context.Limiting`."""
+        return self.function.box  # type: ignore[attr-defined]
 
 
 @dataclass
@@ -127,7 +147,8 @@ def measured_projection(experiment: Experiment, environment: np.ndarray) -> tupl
         measures |= compared(behaviour, Known().fit(experiment.layout, experiment.target), held)
         measures |= prediction_error(behaviour, experiment.target, experiment.cases.reference)
         measures |= cost_of_model(experiment, model_of(behaviour))
-    return Timed(projection, experiment.device), measures
+    timed = TimedWithinLimits if isinstance(projection, Limiting) else Timed
+    return timed(projection, experiment.device), measures
 
 
 def cost_of_model(experiment: Experiment, model: System | None) -> dict[str, float]:

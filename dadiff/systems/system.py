@@ -71,6 +71,20 @@ class Bounds:
                 raise ConfigError(f"system: bounds.{name} is not known; expected {', '.join(known)}")
         return cls(**{name: np.asarray(value, dtype=np.float64) for name, value in (limits or {}).items()})
 
+    def tightened(self, share: float) -> Bounds:
+        """Moved towards each other by a share of half their distance; what has one bound only keeps it.
+
+        Args:
+            share: in [0, 1).
+        """
+        moved: dict[str, np.ndarray] = {}
+        for what in ("input", "state"):
+            low, high = (np.asarray(getattr(self, f"{what}_{end}"), dtype=np.float64) for end in ("low", "high"))
+            with np.errstate(invalid="ignore"):
+                by = np.where(np.isfinite(low) & np.isfinite(high), share * (high - low) / 2, 0.0)
+            moved |= {f"{what}_low": low + by, f"{what}_high": high - by}
+        return Bounds(**moved)
+
     @property
     def any(self) -> bool:
         """Whether anything is bounded."""
