@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from laws import exciting, fleet, trajectories
 
 from dadiff.behaviours import (
     Dynamics,
+    Hankel,
+    HankelLowRank,
     Identified,
     IdentifiedSoft,
     Known,
@@ -87,6 +90,16 @@ def test_the_truth_predicts_itself(rng):
     assert prediction_error(Known().fit(layout, system), system, rng.standard_normal((4, layout.size))) == {
         "prediction_error": pytest.approx(0.0, abs=1e-12)
     }
+
+
+@pytest.mark.parametrize("offset", ["none", "estimated"])
+def test_windows_predict_as_the_dynamics_that_they_identify(offset):
+    """The only trajectory of their span that has this start and these inputs."""
+    robots = fleet(process_noise=0.0)
+    (tau, _), layout, recording = trajectories(robots, 6, 5), robots.layout(6), exciting(120).record(robots)
+    windows = HankelLowRank(offset=offset).fit(layout, robots, recording)
+    assert prediction_error(windows, robots, tau)["prediction_error"] < 1e-9
+    assert prediction_error(Hankel().fit(layout, robots, exciting(30, 0.1).record(robots)), robots, tau) == {}
 
 
 def test_what_makes_no_sense_is_refused(rng):

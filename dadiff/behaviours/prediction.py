@@ -7,7 +7,8 @@ import numpy as np
 from dadiff.behaviours.lifted import Lifted
 from dadiff.behaviours.limited import Limited
 from dadiff.behaviours.manifold import Manifold
-from dadiff.behaviours.sets import Dynamics, TrajectorySet
+from dadiff.behaviours.pins import Pin
+from dadiff.behaviours.sets import Dynamics, Span, TrajectorySet
 from dadiff.systems import Linear, System, TimeVarying
 
 TINY = float(np.finfo(np.float64).tiny)
@@ -16,20 +17,32 @@ TINY = float(np.finfo(np.float64).tiny)
 def prediction_error(learned: TrajectorySet, truth: System, tau: np.ndarray) -> dict[str, float]:
     """Root mean square of x(1:T) as predicted against the truth, over each state's deviation, and averaged over states.
 
-    Nothing is said of sets that hold no dynamics.
+    Nothing is said of sets that do not determine states by x(0) and inputs.
 
     Args:
         tau: trajectories (*robots, plans, d) whose starts and inputs are taken.
     """
-    dynamics = learned if isinstance(learned, Lifted) else model_of(learned)
-    if dynamics is None:
-        return {}
     states, inputs = learned.layout.split(tau)
+    predicted = predicted_by(learned, states[..., 0, :], inputs)
+    if predicted is None:
+        return {}
     over = tuple(range(states.ndim - 1))
     with np.errstate(over="ignore", invalid="ignore"):
-        predicted, true = (by.simulate(states[..., 0, :], inputs)[..., 1:, :] for by in (dynamics, truth))
-        error = np.sqrt(np.square(predicted - true).mean(axis=over) / np.maximum(true.var(axis=over), TINY))
+        true = truth.simulate(states[..., 0, :], inputs)[..., 1:, :]
+        error = np.square(predicted[..., 1:, :] - true).mean(axis=over)
+        error = np.sqrt(error / np.maximum(true.var(axis=over), TINY))
     return {"prediction_error": float(error.mean())}
+
+
+def predicted_by(learned: TrajectorySet, x_init: np.ndarray, inputs: np.ndarray) -> np.ndarray | None:
+    """States (*robots, plans, T+1, n) by dynamics, or by the only trajectory of a span with this x(0) and inputs."""
+    layout = learned.layout
+    if isinstance(learned, Span) and learned.basis.shape[-1] == layout.rank:
+        flat = inputs.reshape(*inputs.shape[:-2], -1)
+        projection = learned.bind(pins=(Pin.initial_state(layout, x_init), Pin(layout.all_inputs, flat)))
+        return layout.states(projection(np.zeros((*x_init.shape[:-1], layout.size))))
+    dynamics = learned if isinstance(learned, Lifted) else model_of(learned)
+    return None if dynamics is None else dynamics.simulate(x_init, inputs)
 
 
 def model_of(behaviour: TrajectorySet | None) -> System | None:

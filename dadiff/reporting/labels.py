@@ -66,6 +66,7 @@ METRICS = {
     "planned_input_error": "control error ‖u(t) − u*(t)‖²",
     "rollout_state_error": "state error after replay",
     "gap": "gap of plan and replay, squared",
+    "gap_nrmse": "replay off its plan [deviations]",
     "dynamics_residual": "dynamics residual, squared",
     "singular_steps": "singular steps of the replay",
     "initial_state_error": "error of x(0), squared",
