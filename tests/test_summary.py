@@ -23,6 +23,18 @@ def test_one_run_is_a_short_list_of_what_it_has():
     assert one_run(run("lqr/hankel", None, "refused")).splitlines()[1].strip() == "refused: too short"
 
 
+def test_a_run_in_closed_loop_says_what_its_episodes_cost():
+    metrics = {
+        "cost_ratio": 1.0,
+        "plan_latency_p99": 0.02,
+        "closed_loop_receding_10": 1.3,
+        "closed_loop_same_receding_10": 1,
+    }
+    lines = one_run(StoredRun(None, Record("0" * 16, "lqr", "finished", metrics=metrics))).splitlines()
+    assert lines[-1].split() == ["receding,", "planning", "every", "10", "1.3"]
+    assert len(lines) == 4
+
+
 def test_several_runs_are_ranked_and_called_by_what_differs():
     runs = [
         run("lqr/none/mlp/seed=0", 1.5),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import shutil
 from collections.abc import Sequence
 
@@ -24,6 +25,8 @@ METRICS = {
     "calls": "network_calls",
     "seconds": "sampling_seconds",
     "seconds for one plan": "plan_latency",
+    "one in a hundred": "plan_latency_p99",
+    "deadlines missed": "deadlines_missed",
     "recording / noise": "recording_residual",
     "demonstrations / noise": "demonstrations_residual",
     "test cases / noise": "cases_residual",
@@ -32,8 +35,10 @@ METRICS = {
 }
 ODD = [title for title, metric in METRICS.items() if metric in ABOUT_DATA]
 """Of these several runs show what says that data are odd: residuals are 1 in good data, counts 0."""
-COLUMNS = ("cost ratio", "state error", "replayed", "plan-replay gap", "seconds")
+COLUMNS = ("cost ratio", "state error", "replayed", "plan-replay gap", "seconds", "seconds for one plan")
 """Of several runs, which are sorted by the first of these that they have."""
+EPISODES = re.compile(r"closed_loop_([a-z]+)_(\d+)")
+"""The cost of episodes over that of the optimum: by controller, and steps between two plans."""
 MOST_ROWS = 30
 NAME_WIDTH, NUMBER_WIDTH, GAP = 34, 9, 2
 
@@ -46,6 +51,9 @@ def one_run(run: StoredRun) -> str:
     for title, metric in METRICS.items():
         if metric in run.metrics:
             table.add_row(f"  {title}", _number(run.metrics[metric]))
+    for metric, cost in run.metrics.items():
+        if episodes := EPISODES.fullmatch(metric):
+            table.add_row("  {}, planning every {}".format(*episodes.groups()), _number(cost))
     return f"{run.name}\n{text(table)}"
 
 
