@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from dadiff.store import Cell, Provenance, Record, Results, Sweep, Sweeps
+from dadiff.store import Provenance, Record, Results, Sweep, Sweeps, SweptRun
 from dadiff.tasks.environments import Environments, condition, encode
 
 PER_STEP = ("planned_state_error", "planned_input_error", "rollout_state_error", "gap", "dynamics_residual")
@@ -56,7 +56,7 @@ class MadeUp:
             axes.setdefault("initial_state", "free")
         key = hashlib.sha256(json.dumps(axes, sort_keys=True).encode()).hexdigest()[:16]
         name = "/".join(str(axes[part]) for part in ("task", "projector", "enforcement", "seed"))
-        self.cells.append(Cell(key, name, axes, status if stored else "waiting", reason))
+        self.cells.append(SweptRun(key, name, axes, status if stored else "waiting", reason))
         if not stored:
             return key
         record = self._record(key, name, status, axes, metrics or {}, notes or {}, reason, step, robots)
@@ -85,7 +85,7 @@ class MadeUp:
             Provenance(seconds=1.0, device="cpu", commit="0123456789abcdef"),
         )  # fmt: skip
 
-    def sweep(self, *extra: Cell) -> None:
+    def sweep(self, *extra: SweptRun) -> None:
         """Write the sweep's record."""
         command = f"dadiff +sweeps={self.name}"
         Sweeps(self.folder).write(Sweep(self.name, command, {"projector": "none,known"}, [*self.cells, *extra]))

@@ -13,7 +13,7 @@ import pandas as pd
 import pytest
 
 from dadiff.errors import DadiffError, DataError, StoreError
-from dadiff.store import Cache, Cell, Record, Results, Sweep, Sweeps
+from dadiff.store import Cache, Record, Results, Sweep, Sweeps, SweptRun
 from dadiff.store.cli import main as dadiff_cache
 from dadiff.store.names import file_name, key_of, kind_of, sweep_name
 
@@ -32,7 +32,7 @@ def store(tmp_path) -> Path:
             tables={"per_step": table},
             arrays={"states": np.ones(3)},
         )
-    Sweeps(tmp_path).write(Sweep("quick", "dadiff -m", {}, [Cell(key, f"run {key}") for key in KEYS]))
+    Sweeps(tmp_path).write(Sweep("quick", "dadiff -m", {}, [SweptRun(key, f"run {key}") for key in KEYS]))
     with Sweeps(tmp_path).running("quick"):
         pass
     return tmp_path

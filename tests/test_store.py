@@ -20,7 +20,7 @@ import pandas as pd
 import pytest
 
 from dadiff.errors import DadiffError, DataError, LockedError, StoreError
-from dadiff.store import Cache, Cell, Provenance, Record, Results, Status, Sweep, Sweeps, store_id
+from dadiff.store import Cache, Provenance, Record, Results, Status, Sweep, Sweeps, SweptRun, store_id
 from dadiff.store.cli import main as dadiff_cache
 
 KEY = "0123456789abcdef"
@@ -221,7 +221,7 @@ def claim_and_die(root: Path) -> None:
 
 
 def test_sweeps_come_back(tmp_path):
-    sweep = Sweep("quick", "dadiff -m", {"seed": "1,2"}, [Cell(KEY, "lqr/known", {"seed": 1}, "failed", "why")])
+    sweep = Sweep("quick", "dadiff -m", {"seed": "1,2"}, [SweptRun(KEY, "lqr/known", {"seed": 1}, "failed", "why")])
     Sweeps(tmp_path).write(sweep)
     assert Sweeps(tmp_path).read("quick") == sweep
     assert Sweeps(tmp_path).names() == ["quick"]

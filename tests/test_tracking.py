@@ -17,7 +17,7 @@ import pandas as pd
 import pytest
 
 from dadiff.errors import ConfigError, StoreError
-from dadiff.store import Cache, Cell, Provenance, Record, Results, Sweep, Sweeps, store_id
+from dadiff.store import Cache, Provenance, Record, Results, Sweep, Sweeps, SweptRun, store_id
 from dadiff.sync import main as dadiff_sync
 from dadiff.sync import sync
 from dadiff.tracking import Tracking
@@ -85,7 +85,7 @@ def test_nothing_is_logged_twice(tracking, tmp_path):
 
 
 def test_what_a_database_holds_is_seen_without_mlflow(tracking, tmp_path):
-    run, cell = store(tmp_path), Cell(KEY, "lqr/known/seed=1", status="finished")
+    run, cell = store(tmp_path), SweptRun(KEY, "lqr/known/seed=1", status="finished")
     Sweeps(tmp_path).write(Sweep("one", "dadiff", {}, [cell]))
     assert not tracking.mirrors(tmp_path, [run])
     tracking.log_run(run)
@@ -184,15 +184,15 @@ def test_a_training_is_a_model_with_a_planner_that_loads(tracking, tmp_path, mon
     np.testing.assert_array_equal(before.plan(**given).states, after.plan(**given).states)
 
 
-def sweep_of(*cells: Cell, seeds: str = "1") -> Sweep:
+def sweep_of(*cells: SweptRun, seeds: str = "1") -> Sweep:
     return Sweep("quick", "dadiff +sweeps=quick", {"seed": seeds}, list(cells))
 
 
 def test_a_sweep_is_one_parent_however_often_it_is_run(tracking, tmp_path):
     run, parents = store(tmp_path), []
-    cells = Cell(run.key, run.name, run.axes, "finished"), Cell("f" * 16, "other", {}, "failed", "why")
+    cells = SweptRun(run.key, run.name, run.axes, "finished"), SweptRun("f" * 16, "other", {}, "failed", "why")
     for status in ("waiting", "finished"):
-        Sweeps(tmp_path).write(sweep_of(Cell(run.key, run.name, run.axes, status), cells[1]))
+        Sweeps(tmp_path).write(sweep_of(SweptRun(run.key, run.name, run.axes, status), cells[1]))
         parents.append(tracking.log_sweep(tmp_path, "quick"))
         tracking.log_run(run, parents[-1])
     assert parents[0] == parents[1]
@@ -208,7 +208,7 @@ def test_a_sweep_is_one_parent_however_often_it_is_run(tracking, tmp_path):
 def test_a_sweep_opens_as_a_table_with_what_varies_in_front_and_charts_on_log_axes(tracking, tmp_path):
     axes = {"projector": "known", "seed": 1}
     names = {KEY: "lqr/known/mlp/seed=1", "f" * 16: "lqr/none/mlp/seed=1"}
-    cells = [Cell(key, name, axes | {"projector": name.split("/")[1]}) for key, name in names.items()]
+    cells = [SweptRun(key, name, axes | {"projector": name.split("/")[1]}) for key, name in names.items()]
     Sweeps(tmp_path).write(sweep_of(*cells))
     tracking.catch_up(tmp_path, [store(tmp_path)], ["quick"])
     (mirror,) = runs(tracking, "tags.kind = 'run'")
@@ -222,7 +222,7 @@ def test_a_sweep_opens_as_a_table_with_what_varies_in_front_and_charts_on_log_ax
 
 
 def test_the_note_of_a_sweep_says_what_its_report_found(tracking, tmp_path):
-    Sweeps(tmp_path).write(sweep_of(Cell(KEY, "a")))
+    Sweeps(tmp_path).write(sweep_of(SweptRun(KEY, "a")))
     (tmp_path / "reports" / "quick").mkdir(parents=True)
     (tmp_path / "reports" / "quick" / "report.json").write_text('{"format": 2, "sentences": ["Helps: it does."]}')
     tracking.log_sweep(tmp_path, "quick")
@@ -232,7 +232,7 @@ def test_the_note_of_a_sweep_says_what_its_report_found(tracking, tmp_path):
 
 def test_a_sweep_that_was_extended_shows_what_it_is_now(tracking, tmp_path):
     """MLflow refuses to change a parameter, and keeps the larger of two metrics of one step."""
-    first, second = Cell("a" * 16, "a", {"seed": 0}, "finished"), Cell("b" * 16, "b", {"seed": 1}, "finished")
+    first, second = SweptRun("a" * 16, "a", {"seed": 0}, "finished"), SweptRun("b" * 16, "b", {"seed": 1}, "finished")
     for cells, seeds in (([first], "0"), ([first, second], "0,1")):
         Sweeps(tmp_path).write(sweep_of(*cells, seeds=seeds))
         tracking.log_sweep(tmp_path, "quick")
@@ -266,7 +266,7 @@ def made(tmp_path_factory):
     root = tmp_path_factory.mktemp("made") / "outputs"
     run = store(root)
     Results(root).write_failure(Record("f" * 16, "other", "failed", "why"))
-    cells = Cell(run.key, run.name, {}, "finished"), Cell("f" * 16, "other", {}, "failed", "why")
+    cells = SweptRun(run.key, run.name, {}, "finished"), SweptRun("f" * 16, "other", {}, "failed", "why")
     Sweeps(root).write(sweep_of(*cells))
     (root / "reports" / "quick").mkdir(parents=True)
     (root / "reports" / "quick" / "index.html").write_text("<p>report</p>")

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from typing import Any
 
 from dadiff.running.identity import SHARED, Artefact, Identity, identify
-from dadiff.store import Cache, Cell, Results
+from dadiff.store import Cache, Results, SweptRun
 
 
 @dataclass(frozen=True)
-class PlannedCell:
+class PlannedRun:
     """One key of the sweep.
 
     Args:
@@ -30,9 +30,9 @@ class PlannedCell:
     status: str | None
     is_done: bool
 
-    def cell(self) -> Cell:
+    def cell(self) -> SweptRun:
         """As a sweep's record names it."""
-        return Cell(self.identity.key, self.identity.name, self.identity.axes, self.status or "waiting")
+        return SweptRun(self.identity.key, self.identity.name, self.identity.axes, self.status or "waiting")
 
 
 @dataclass(frozen=True)
@@ -58,15 +58,15 @@ class Preparation:
 class Plan:
     """The cells of a multirun in their order, and the preparations, shared ones first."""
 
-    cells: Sequence[PlannedCell]
+    cells: Sequence[PlannedRun]
     preparations: Sequence[Preparation]
 
     @property
-    def waiting(self) -> list[PlannedCell]:
+    def waiting(self) -> list[PlannedRun]:
         """The cells that are still to be run."""
         return [cell for cell in self.cells if not cell.is_done]
 
-    def needs(self, cell: PlannedCell) -> frozenset[str]:
+    def needs(self, cell: PlannedRun) -> frozenset[str]:
         """Keys of the preparations that must end before this cell starts."""
         return frozenset(p.artefact.key for p in self.preparations) & _keys(cell.identity)
 
@@ -87,13 +87,13 @@ def make_plan(configs: Sequence[Mapping[str, Any]]) -> Plan:
     return Plan(cells, _preparations([cell for cell in cells if not cell.is_done]))
 
 
-def _planned(config: dict[str, Any], identity: Identity, copies: int) -> PlannedCell:
+def _planned(config: dict[str, Any], identity: Identity, copies: int) -> PlannedRun:
     results = Results(config["output_dir"])
     is_done = results.is_done(identity.key) and not config.get("force")
-    return PlannedCell(config, identity, copies, results.status(identity.key), is_done)
+    return PlannedRun(config, identity, copies, results.status(identity.key), is_done)
 
 
-def _preparations(cells: Sequence[PlannedCell]) -> list[Preparation]:
+def _preparations(cells: Sequence[PlannedRun]) -> list[Preparation]:
     """What trainings need, trainings, test cases; each once, with the configuration of the first cell that needs it."""
     found: dict[str, Preparation] = {}
     for position in range(len(SHARED)):
@@ -105,7 +105,7 @@ def _preparations(cells: Sequence[PlannedCell]) -> list[Preparation]:
     return list(found.values())
 
 
-def _is_cached(cell: PlannedCell, artefact: Artefact) -> bool:
+def _is_cached(cell: PlannedRun, artefact: Artefact) -> bool:
     return Cache(cell.config["output_dir"]).contains(artefact.kind, artefact.key)
 
 
@@ -128,9 +128,9 @@ def describe(plan: Plan) -> str:
     return "\n".join(lines)
 
 
-def _state(cell: PlannedCell) -> str:
+def _state(cell: PlannedRun) -> str:
     return "done" if cell.is_done else f"{cell.status}, to run" if cell.status else "to run"
 
 
-def _copies(cell: PlannedCell) -> str:
+def _copies(cell: PlannedRun) -> str:
     return f"  ({cell.copies} times in the sweep)" if cell.copies > 1 else ""

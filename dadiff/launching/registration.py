@@ -52,7 +52,7 @@ class RaySchema:
 class CellsSchema:
     """The sweeper `cells`, as Hydra's `basic`."""
 
-    _target_: str = "dadiff.launching.sweeper.CellSweeper"
+    _target_: str = "dadiff.launching.sweeper.RunSweeper"
     max_batch_size: int | None = None
     params: dict[str, str] | None = None
 
@@ -72,7 +72,7 @@ def register() -> None:
     from dadiff.launching.processes import ProcessesLauncher
     from dadiff.launching.ray import RayLauncher
     from dadiff.launching.slurm import SlurmLauncher
-    from dadiff.launching.sweeper import CellSweeper
+    from dadiff.launching.sweeper import RunSweeper
 
     Plugins.is_in_toplevel_plugins_module = staticmethod(_is_plugin)  # type: ignore[assignment]
     launchers: dict[str, tuple[type[Plugin], type]] = {
@@ -83,7 +83,7 @@ def register() -> None:
     for name, (launcher, schema) in launchers.items():
         plugins.register(launcher)
         ConfigStore.instance().store(group="hydra/launcher", name=f"{name}_schema", node=schema)
-    plugins.register(CellSweeper)
+    plugins.register(RunSweeper)
     ConfigStore.instance().store(group="hydra/sweeper", name="cells", node=CellsSchema)
     install()
 

@@ -14,10 +14,10 @@ from pathlib import Path
 
 from dadiff.launching import jobs
 from dadiff.launching.outcome import Outcome
-from dadiff.launching.plan import Plan, PlannedCell, Preparation
+from dadiff.launching.plan import Plan, PlannedRun, Preparation
 from dadiff.launching.work import Work
 from dadiff.running.digest import digest
-from dadiff.store import DONE, Cell, Results, StoredRun, Sweep, Sweeps
+from dadiff.store import DONE, Results, StoredRun, Sweep, Sweeps, SweptRun
 from dadiff.tracking import Tracking
 from dadiff.tracking.client import spared
 from dadiff.tracking.content import results_table
@@ -79,7 +79,7 @@ class SweepRun:
         """What is to be done: data sets and trainings first, cells after what they need."""
         return [*map(self._preparation, self.plan.preparations), *map(self._run, self.plan.waiting)]
 
-    def ended(self, cell: PlannedCell, outcome: Outcome) -> None:
+    def ended(self, cell: PlannedRun, outcome: Outcome) -> None:
         """Record a cell's failure on disk, beside the results of the others."""
         if outcome.status != "finished":
             jobs.record_end(cell.identity, cell.config, outcome.status, outcome.reason or outcome.status)
@@ -112,24 +112,24 @@ class SweepRun:
         results = Results(self.output_dir)
         return [results.read(cell.key) for cell in sweep.cells if results.status(cell.key) is not None]
 
-    def record(self, cells: Sequence[Cell]) -> Sweep:
+    def record(self, cells: Sequence[SweptRun]) -> Sweep:
         """The sweep as stored."""
         return Sweep(self.name, self.command, dict(self.definition), list(cells))
 
-    def cells(self, outcomes: Mapping[str, Outcome] | None = None, unknown: str = "waiting") -> list[Cell]:
+    def cells(self, outcomes: Mapping[str, Outcome] | None = None, unknown: str = "waiting") -> list[SweptRun]:
         """How each cell stands: as its run says, unless this start of the sweep saw it fail."""
         return [self._cell(planned, outcomes or {}, unknown) for planned in self.plan.cells]
 
-    def _cell(self, planned: PlannedCell, outcomes: Mapping[str, Outcome], unknown: str) -> Cell:
+    def _cell(self, planned: PlannedRun, outcomes: Mapping[str, Outcome], unknown: str) -> SweptRun:
         identity = planned.identity
         outcome = outcomes.get(identity.key)
         if outcome is not None and outcome.status not in DONE:
-            return Cell(identity.key, identity.name, identity.axes, outcome.status, outcome.reason)
+            return SweptRun(identity.key, identity.name, identity.axes, outcome.status, outcome.reason)
         results = Results(self.output_dir)
         if not (results.is_done(identity.key) and (outcome is not None or planned.is_done)):
-            return Cell(identity.key, identity.name, identity.axes, unknown)
+            return SweptRun(identity.key, identity.name, identity.axes, unknown)
         stored = results.read(identity.key)
-        return Cell(identity.key, identity.name, identity.axes, stored.status, stored.record.reason)
+        return SweptRun(identity.key, identity.name, identity.axes, stored.status, stored.record.reason)
 
     def _preparation(self, preparation: Preparation) -> Work:
         artefact = preparation.artefact
@@ -137,7 +137,7 @@ class SweepRun:
         arguments, alone = (preparation.config, artefact.kind), artefact.kind == "denoiser"
         return Work(artefact.key, preparation.name, jobs.build, arguments, log_file, preparation.needs, alone)
 
-    def _run(self, cell: PlannedCell) -> Work:
+    def _run(self, cell: PlannedRun) -> Work:
         key = cell.identity.key
         log_file = self.folder / "logs" / f"{key}.log"
         return Work(key, cell.identity.name, jobs.run, (cell.config,), log_file, self.plan.needs(cell))

@@ -13,7 +13,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from dadiff.errors import ConfigError
 
 
-class CellSweeper(BasicSweeper):
+class RunSweeper(BasicSweeper):
     """As Hydra's `basic`, but nothing is written and cells are composed by the launcher alone."""
 
     def sweep(self, arguments: list[str]) -> Any:

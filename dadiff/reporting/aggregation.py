@@ -19,7 +19,7 @@ import pandas as pd
 
 from dadiff.errors import StoreError
 from dadiff.reporting.selection import Selector, matches
-from dadiff.reporting.sources import Cell, Sweep
+from dadiff.reporting.sources import ReportedRun, Sweep
 from dadiff.reporting.statistics import Draws
 
 PRESETS = ("_fixed", "_unchecked")  # what they set is an axis of its own
@@ -90,15 +90,15 @@ class Method:
     """
 
     axes: dict[str, Any]
-    cells: list[Cell] = field(repr=False)
+    cells: list[ReportedRun] = field(repr=False)
 
     @property
-    def finished(self) -> list[Cell]:
+    def finished(self) -> list[ReportedRun]:
         """Replicates with results."""
         return [cell for cell in self.cells if cell.status == "finished"]
 
     @property
-    def lost(self) -> list[Cell]:
+    def lost(self) -> list[ReportedRun]:
         """Replicates without results."""
         return [cell for cell in self.cells if cell.status != "finished"]
 
@@ -168,7 +168,7 @@ class Evidence:
         return found[0] if found else None
 
 
-def shared_axes(cell: Cell) -> dict[str, Any]:
+def shared_axes(cell: ReportedRun) -> dict[str, Any]:
     """What a cell has in common with its replicates; presets such as `known_fixed` go by the projector they set."""
     axes = {k: v for k, v in cell.axes.items() if v is not None and not is_seed(k) and k not in ALIASES}
     for preset in PRESETS:
@@ -211,23 +211,23 @@ def _narrowed(runs: Runs) -> Runs:
     return Runs(levels, cells)
 
 
-def _objects(cells: list[Cell]) -> np.ndarray:
+def _objects(cells: list[ReportedRun]) -> np.ndarray:
     found = np.empty(len(cells), dtype=object)
     found[:] = cells
     return found
 
 
-def pairs(method: Method, other: Method) -> list[tuple[Cell, Cell]]:
+def pairs(method: Method, other: Method) -> list[tuple[ReportedRun, ReportedRun]]:
     """Finished runs of both that are of the same draw."""
     return [(a, b) for a in method.finished for b in other.finished if _same_draw(a, b)]
 
 
-def _same_draw(a: Cell, b: Cell) -> bool:
+def _same_draw(a: ReportedRun, b: ReportedRun) -> bool:
     shared = [name for name in a.axes if is_seed(name) and b.axes.get(name) is not None]
     return all(a.axes[name] in (b.axes[name], None) for name in shared)
 
 
-def seeds_of(cell: Cell) -> dict[str, Any]:
+def seeds_of(cell: ReportedRun) -> dict[str, Any]:
     """The axes of replication that apply to a cell."""
     return {name: value for name, value in cell.axes.items() if is_seed(name) and value is not None}
 
@@ -270,11 +270,11 @@ def _full(seeds: list[dict[str, Any]], kept: list[int], axes: list[str]) -> int:
     return math.prod(len(_values(seeds, axis, kept)) for axis in axes)
 
 
-def _along_time(cell: Cell, metric: str) -> bool:
+def _along_time(cell: ReportedRun, metric: str) -> bool:
     return _table_with(cell, metric) == "per_step"
 
 
-def _table_with(cell: Cell, metric: str) -> str | None:
+def _table_with(cell: ReportedRun, metric: str) -> str | None:
     """The table of a run that holds a metric per plan or per step."""
     for name in ("per_step", "per_plan"):
         if cell.has_column(name, metric):
@@ -286,14 +286,14 @@ EPISODES = re.compile(r"closed_loop_(?P<same>same_)?(?P<controller>[a-z]+)_(?P<e
 """Metrics of episodes in closed loop: the cost over that of the expert, at the shortest or the same interval."""
 
 
-def _episodes(cell: Cell, wanted: re.Match[str]) -> np.ndarray:
+def _episodes(cell: ReportedRun, wanted: re.Match[str]) -> np.ndarray:
     """([robots,] cases)."""
     table = cell.table("closed_loop")
     rows = table[(table["controller"] == wanted["controller"]) & (table["every"] == int(wanted["every"]))]
     return dense(rows, "cost_ratio_same" if wanted["same"] else "cost_ratio", where=f"run {cell.key}, closed_loop")
 
 
-def _of_cell(cell: Cell, metric: str, group: str | None) -> np.ndarray:
+def _of_cell(cell: ReportedRun, metric: str, group: str | None) -> np.ndarray:
     if name := _table_with(cell, metric):
         if (name, metric) not in cell.means:
             values = dense(cell.table(name), metric, where=f"run {cell.key}, {name}")
@@ -308,13 +308,13 @@ def _of_cell(cell: Cell, metric: str, group: str | None) -> np.ndarray:
     return np.asarray(cell.metrics[metric], dtype=np.float64)
 
 
-def _robots_in(cell: Cell, group: str) -> np.ndarray:
+def _robots_in(cell: ReportedRun, group: str) -> np.ndarray:
     if not cell.has("robots"):
         raise StoreError(f"run {cell.key}: has no table of its robots, so none is of group {group}; run it again")
     return (cell.table("robots")["group"] == group).to_numpy()
 
 
-def has_metric(cells: list[Cell], metric: str) -> bool:
+def has_metric(cells: list[ReportedRun], metric: str) -> bool:
     """Whether each of these runs has a metric."""
     return all(metric in cell.metrics or _table_with(cell, metric) for cell in cells)
 

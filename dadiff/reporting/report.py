@@ -8,7 +8,7 @@ from typing import Any
 from dadiff.reporting.aggregation import Evidence, Method
 from dadiff.reporting.claims import Claim, Verdict, judge
 from dadiff.reporting.definitions import Definition, Item
-from dadiff.reporting.sources import Cell
+from dadiff.reporting.sources import ReportedRun
 
 WITHOUT_INTERVALS = ("paths", "diffusion", "chain")
 """Kinds of figures that show single plans or runs."""
@@ -47,9 +47,9 @@ class Report:
         return " && ".join(filter(None, (self.evidence.sweep.command, self.command)))
 
     @property
-    def lost(self) -> dict[str, list[Cell]]:
+    def lost(self) -> dict[str, list[ReportedRun]]:
         """Cells without results, by what became of them."""
-        groups: dict[str, list[Cell]] = {}
+        groups: dict[str, list[ReportedRun]] = {}
         for cell in self.evidence.sweep.cells:
             if cell.status != "finished":
                 groups.setdefault(cell.outcome, []).append(cell)

@@ -37,8 +37,8 @@ LOG = re.compile(r"; log: \S+$")
 
 
 @dataclass(frozen=True)
-class Cell:
-    """One cell of a sweep, with its stored run if there is one.
+class ReportedRun:
+    """One run of a sweep, with what is stored of it, if anything.
 
     Args:
         key: hash of what determines the result.
@@ -143,18 +143,18 @@ class Sweep:
 
     name: str
     command: str
-    cells: list[Cell]
+    cells: list[ReportedRun]
     tables: Mapping[str, str] = field(default_factory=dict)
 
     @property
-    def finished(self) -> list[Cell]:
+    def finished(self) -> list[ReportedRun]:
         """Cells with results."""
         return [cell for cell in self.cells if cell.status == "finished"]
 
     @cached_property
-    def duplicates(self) -> list[list[Cell]]:
+    def duplicates(self) -> list[list[ReportedRun]]:
         """Groups of cells that resolved to the same configuration."""
-        groups: dict[str, list[Cell]] = {}
+        groups: dict[str, list[ReportedRun]] = {}
         for cell in self.cells:
             same = json.dumps(cell.config, sort_keys=True) if cell.record else cell.key
             groups.setdefault(same, []).append(cell)
@@ -186,6 +186,8 @@ def _read(output_dir: Path, name: str) -> Sweep:
         run = results.read(cell.key) if results.status(cell.key) else None
         waiting = None if run else cell.reason or (cell.status if cell.status != "waiting" else None)
         cells.append(
-            Cell(cell.key, cell.name, {**cell.axes, **(run.axes if run else {})}, run, waiting, links.get(cell.key))
+            ReportedRun(
+                cell.key, cell.name, {**cell.axes, **(run.axes if run else {})}, run, waiting, links.get(cell.key)
+            )
         )
     return Sweep(stored.name, stored.command, cells)

@@ -7,12 +7,11 @@ from dadiff.store.cache import Cache, Entry
 from dadiff.store.folder import is_read_only, store_id
 from dadiff.store.record import DONE, Provenance, Record, Status
 from dadiff.store.results import Results, StoredRun
-from dadiff.store.sweeps import Cell, Lease, Sweep, Sweeps
+from dadiff.store.sweeps import Lease, Sweep, Sweeps, SweptRun
 
 __all__ = [
     "DONE",
     "Cache",
-    "Cell",
     "Entry",
     "Lease",
     "Provenance",
@@ -22,6 +21,7 @@ __all__ = [
     "StoredRun",
     "Sweep",
     "Sweeps",
+    "SweptRun",
     "is_read_only",
     "store_id",
 ]

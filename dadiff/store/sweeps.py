@@ -25,8 +25,8 @@ HOLDER = "launcher.json"
 
 
 @dataclass(frozen=True)
-class Cell:
-    """One cell of a sweep.
+class SweptRun:
+    """One run of a sweep, as its record lists it.
 
     Args:
         status: "waiting" until it ended, then the status of its run, or "interrupted".
@@ -52,7 +52,7 @@ class Sweep:
     name: str
     command: str
     definition: dict[str, str]
-    cells: Sequence[Cell]
+    cells: Sequence[SweptRun]
 
 
 @dataclass(frozen=True)

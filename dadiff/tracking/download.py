@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dadiff.errors import StoreError
-from dadiff.store import Cell, Results, Sweep, Sweeps
+from dadiff.store import Results, Sweep, Sweeps, SweptRun
 from dadiff.store.files import make_folder
 from dadiff.store.names import file_name, key_of
 from dadiff.store.record import read_record
@@ -59,15 +59,15 @@ def _all(client: MlflowClient, experiments: list[str], condition: str) -> list[R
     return list({run.data.tags["key"]: run for run in found}.values())
 
 
-def _fetch(client: MlflowClient, run: Run, folder: Path) -> Cell:
+def _fetch(client: MlflowClient, run: Run, folder: Path) -> SweptRun:
     """Download one run; one that failed before it had a record keeps its status."""
     key = key_of(run.data.tags["key"])
     name = run.info.run_name or key
     files = [file_name(item.path) for item in client.list_artifacts(run.info.run_id) if not item.is_dir]
     if RECORD not in files:
-        return Cell(key, name, status=run.info.status.lower())
+        return SweptRun(key, name, status=run.info.status.lower())
     target = make_folder(Results(folder).folder(key))
     for path in files:
         client.download_artifacts(run.info.run_id, path, str(target))
     record = read_record(target / RECORD)
-    return Cell(key, record.name, dict(record.axes), record.status, record.reason)
+    return SweptRun(key, record.name, dict(record.axes), record.status, record.reason)

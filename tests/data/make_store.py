@@ -15,7 +15,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from made_up import MadeUp, chain_table, example_arrays
 
-from dadiff.store import Cell
+from dadiff.store import SweptRun
 
 STORE = Path(__file__).parent / "store"
 CONDITIONS = {"schedule": {"C1": True, "C2": True, "C3": True}}
@@ -52,7 +52,7 @@ def lqr() -> None:
     store.run(0.1, projector="known", enforcement="normalised", chain=chain_table(40, grows=True), **exact)
     store.run(0.1, projector="none", chain=chain_table(40, grows=False), **exact)
     twin = next(cell for cell in store.cells if cell.axes["projector"] == "known")
-    store.sweep(Cell(twin.key, "the same again", twin.axes))
+    store.sweep(SweptRun(twin.key, "the same again", twin.axes))
 
 
 def lengths() -> None:

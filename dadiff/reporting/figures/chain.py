@@ -12,7 +12,7 @@ from dadiff.reporting.aggregation import Evidence, varying
 from dadiff.reporting.figures.style import legend_below, letter, log_axis, looks_of, panels, tag
 from dadiff.reporting.labels import method_name
 from dadiff.reporting.selection import Selector
-from dadiff.reporting.sources import Cell
+from dadiff.reporting.sources import ReportedRun
 
 PANELS = {
     "on_support": "squared distance on the support",
@@ -74,7 +74,7 @@ def collect(evidence: Evidence, *, cells: Selector) -> Chain:
     return Chain(traces, [cell.key for _, cell in followed], notes)
 
 
-def _trace(cell: Cell, label: str, axes: dict[str, Any]) -> Trace:
+def _trace(cell: ReportedRun, label: str, axes: dict[str, Any]) -> Trace:
     table = cell.table("chain")
     stages = {name: table[table["stage"] == name].set_index("i") for name in ("predict", "project")}
     last = stages["project"] if len(stages["project"]) else stages["predict"]
