@@ -11,6 +11,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from xml.etree import ElementTree
 
 import matplotlib
 import numpy as np
@@ -21,12 +22,11 @@ from matplotlib.markers import CARETDOWN
 
 from dadiff.errors import ConfigError, StoreError
 from dadiff.outside import without_passwords
-from dadiff.reporting import cli, configurations, labels, latex
+from dadiff.reporting import cli, configurations, labels, latex, slim
 from dadiff.reporting.aggregation import Evidence, grid, pair, varying
 from dadiff.reporting.definitions import FOLDER, Item, for_sweep, load, names
 from dadiff.reporting.figures import diffusion, paths
 from dadiff.reporting.figures.style import COLOURS, INK, MARKERS, OTHER, RC, looks_of, render
-from dadiff.reporting.render import to_json
 from dadiff.reporting.report import build
 from dadiff.reporting.selection import matches
 from dadiff.reporting.sources import read_sweeps
@@ -562,11 +562,27 @@ def test_reports_need_no_torch(tmp_path):
 
 def test_the_json_keeps_its_words_and_has_a_list_of_numbers_on_a_line():
     content = {"lines": ["between [0.1, 0.2]"], "values": [1.23456789, 2, None], "none": []}
-    text = to_json(content)
+    text = slim.numbers(content)
     assert '"between [0.1, 0.2]"' in text
     assert json.loads(text) == {**content, "values": [1.23457, 2, None]}
-    assert '"values": [1.23457,2' not in to_json({"values": [1.0, "x"]})
-    assert '"values": [1.0,2.0]' in to_json({"values": [1.0, 2.0]})
+    deep = {"figures": {"errors": {"content": {"values": [1.0, 2.0], "labels": ["a", "FF†"]}}}}
+    assert '"content": {"values":[1.0,2.0],"labels":["a","FF†"]}' in slim.numbers(deep)
+
+
+def test_a_drawing_in_fewer_bytes_is_the_same_drawing():
+    figure = load("fleet").figures[0]
+    drawn = render(figure.collect(evidence("fleet_made_up"), **figure.options), 2, ("svg",))["svg"]
+    small = slim.drawing(drawn)
+    assert len(small) < 0.75 * len(drawn)
+    assert slim.drawing(small) == small
+    before, after = (ElementTree.fromstring(content) for content in (drawn, small))
+    places = [
+        [(float(use.get("x")), float(use.get("y"))) for use in tree.iter("{http://www.w3.org/2000/svg}use")]
+        for tree in (before, after)
+    ]
+    np.testing.assert_allclose(*places, atol=0.0051)
+    words = [[text.text for text in tree.iter("{http://www.w3.org/2000/svg}text")] for tree in (before, after)]
+    assert words[0] == words[1]
 
 
 def test_the_boundary_lies_where_a_recording_stops_helping(tmp_path):

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -16,17 +15,14 @@ from typing import Any
 import numpy as np
 
 from dadiff.errors import StoreError
-from dadiff.reporting import configurations, published, publishing, story
-from dadiff.reporting.claims import read_ledger
+from dadiff.reporting import configurations, published, publishing, slim, story
+from dadiff.reporting.claims import Verdict, read_ledger
 from dadiff.reporting.definitions import FOLDER
 from dadiff.reporting.latex import to_latex
 from dadiff.reporting.page import FORMS, draw, to_html, untagged
 from dadiff.reporting.report import Part, Report
 from dadiff.reporting.tables import to_csv
 from dadiff.store.files import make_folder, strict
-
-DIGITS = 6
-"""Of numbers in report.json: the last ones differ between processors."""
 
 PUBLISHED = ("report.json", "configurations.yaml", "tables/*.csv", "figures/*.svg")
 
@@ -45,10 +41,10 @@ def render(report: Report, folder: Path) -> Path:
         _write_tables(report, folder / "tables")
         for name, drawing in drawings.items():
             for form, content in drawing.files.items():
-                whole = with_panel(untagged(content)) if form == "svg" else content
+                whole = slim.drawing(with_panel(untagged(content))) if form == "svg" else content
                 (folder / "figures" / f"{name}.{form}").write_bytes(whole)
         shown = numbers(report)
-        (folder / "report.json").write_text(to_json(shown), "utf-8")
+        (folder / "report.json").write_text(slim.numbers(shown), "utf-8")
         (folder / "configurations.yaml").write_text(configurations.to_yaml(report.evidence.sweep), "utf-8")
         (folder / "index.html").write_text(to_html(report, shown, drawings), "utf-8")
         _remove(folder, older - _parts_in(folder))
@@ -121,7 +117,7 @@ def numbers(report: Report) -> dict[str, Any]:
         "commands": [sweep.command, report.command],
         "cells": cells,
         "duplicates": [[cell.key for cell in group] for group in sweep.duplicates],
-        "claims": [_plain(verdict) for verdict in report.verdicts],
+        "claims": [_claim(verdict) for verdict in report.verdicts],
         "tables": {part.item.id: _part(part) for part in report.tables},
         "figures": {part.item.id: _part(part) for part in report.figures},
     }
@@ -129,18 +125,11 @@ def numbers(report: Report) -> dict[str, Any]:
     return {**said, "sentences": story.sentences(said, story.ledger(said, []))}
 
 
-def to_json(content: dict[str, Any]) -> str:
-    """Indented, with a list of numbers on one line, to `DIGITS` significant digits."""
-    text = json.dumps(_rounded(content), indent=1, allow_nan=False)
-    return re.sub(r"\[\n[-+\d.eE,\s]*\]", lambda found: re.sub(r"\s+", "", found[0]), text) + "\n"
-
-
-def _rounded(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {name: _rounded(part) for name, part in value.items()}
-    if isinstance(value, list):
-        return [_rounded(part) for part in value]
-    return float(f"{value:.{DIGITS}g}") if isinstance(value, float) else value
+def _claim(verdict: Verdict) -> dict[str, Any]:
+    """A verdict; what its methods were configured with stands in configurations.yaml, by their runs."""
+    content: dict[str, Any] = _plain(verdict)
+    findings = [{name: part for name, part in found.items() if name != "axes"} for found in content["findings"]]
+    return {**content, "findings": findings}
 
 
 def _part(part: Part) -> dict[str, Any]:
