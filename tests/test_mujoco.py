@@ -5,15 +5,19 @@ from __future__ import annotations
 import os
 import pickle
 import sys
+from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from laws import composed
 
+from dadiff.diffusion.samplers import DDIM
+from dadiff.diffusion.schedule import paper_linear
 from dadiff.errors import ConfigError, DataError, MissingExtraError
 from dadiff.evaluation import closed_loop
-from dadiff.planning import Planner
+from dadiff.planning import Planner, Plans
+from dadiff.planning.animation import Scene, animate, drawn
 from dadiff.planning.codec import Decoder, Encoder
 from dadiff.running.assembly import Experiment
 from dadiff.running.experiment import execute
@@ -24,9 +28,12 @@ from dadiff.systems import (
     MujocoRobot,
     Simulated,
     mujoco_robot,
+    rendering,
 )
 from dadiff.systems.mjcf import Mjcf, located, mujoco
 from dadiff.systems.rest import at_rest
+from dadiff.tasks import Manoeuvre
+from dadiff.trajectory.coordinates import physical
 
 pytest.importorskip("mujoco", reason="the extra mujoco is not installed")
 
@@ -271,3 +278,48 @@ def test_a_run_plans_and_replays_in_the_simulator(task, projector, tmp_path, mon
     if projector == "known_fixed":
         assert metrics["gap_nrmse"] < 1e-6
     assert Planner.load(run.folder).system.robots == (2,)
+
+
+def reaching(time_step: float = 0.02) -> tuple[Planner, Plans, np.ndarray]:
+    """A reacher that moves from rest, its planner and its E."""
+    family, task = (
+        MujocoFamily("reacher", ARM),
+        Manoeuvre(
+            horizon=6, robots=1, interpolation=1, extrapolation=0, state_cost=(1, 1, 0.1, 0.1), init_range=(1, 1, 0, 0)
+        ),
+    )
+    robots = task.target(family)
+    cases = task.cases(robots, 1, np.random.default_rng(0))
+    layout = robots.layout(task.horizon)
+    planner = Planner(task, robots, paper_linear(), DDIM(2), lambda tau, i, E: 0 * tau, physical(layout))
+    return planner, Plans(layout, cases.reference, 0, time_step=time_step), cases.environment[0, 0]
+
+
+def test_a_robot_is_drawn_as_its_links_lie(pendulum, reacher):
+    x = np.array([0.3, 0.2, 0.0, 0.0])
+    cart, tip = np.array([0.3, 0.0]), 0.6 * np.array([np.sin(0.2), np.cos(0.2)])
+    np.testing.assert_allclose(pendulum.outline(x)[-2:], [cart, cart + tip], atol=2e-3)
+    np.testing.assert_allclose(pendulum.position(x), cart + tip, atol=2e-3)
+    assert (pendulum.plane, reacher.plane) == (("x [m]", "z [m]"), ("x [m]", "y [m]"))
+    elbow = 0.1 * np.array([np.cos(0.3), np.sin(0.3)])
+    hand = elbow + 0.11 * np.array([np.cos(0.5), np.sin(0.5)])
+    np.testing.assert_allclose(reacher.outline(x)[[0, 1, -1]], [[0, 0], elbow, hand], atol=1e-9)
+
+
+def test_it_is_filmed_rendered_where_that_is_possible(tmp_path, monkeypatch):
+    planner, plans, E = reaching()
+    scene = Scene.of(planner, plans, E)
+    assert scene.executed.shape == (1, 7, 2)
+    goal = planner.task.goal(planner.system, E)
+    np.testing.assert_allclose(scene.target, planner.system.position(goal).reshape(2))
+    monkeypatch.setattr(rendering, "_context", contextmanager(lambda: iter([None])))
+    bare = Scene.of(planner, plans, E)
+    assert bare.frames is None
+    if scene.frames is not None:  # there is EGL or OSMesa
+        assert scene.frames.shape == (7, 320, 320, 3)
+        assert (scene.frames[0] != scene.frames[-1]).any()
+    for k, one in enumerate([scene, bare]):
+        figure, update = drawn(one)
+        update(6)
+        figure.savefig(tmp_path / f"{k}.png")
+    assert animate(planner, plans, E, tmp_path / "reacher.gif").stat().st_size > 1000

@@ -98,6 +98,13 @@ def test_a_system_that_varies_ends_where_its_matrices_end(rng):
             ask()
 
 
+def test_robots_of_a_linear_fleet_are_taken_by_their_numbers(rng):
+    robots, x, u = fleet(), rng.standard_normal((3, 2, 3)), rng.standard_normal((3, 2, 2))
+    np.testing.assert_array_equal(robots.take([2, 0]).step(x[[2, 0]], u[[2, 0]]), robots.step(x, u)[[2, 0]])
+    with pytest.raises(NotApplicableError, match="Linear does not give some of its robots"):
+        double_integrator().take([0])
+
+
 def test_of_a_system_that_varies_nothing_is_recorded():
     with pytest.raises(NotApplicableError, match=r"varies in time, .* use projector=known"):
         GaussianExcitation(length=4).record(varying_system(3, 2, 5, seed=0))

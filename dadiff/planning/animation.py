@@ -1,8 +1,8 @@
-"""An animation of robots that execute their plans: in the plane of the first two states, at the pace of the plans."""
+"""An animation of robots that execute their plans, at their pace: in the robots' plane, and rendered if they can be."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,6 +13,7 @@ from dadiff.errors import DataError
 from dadiff.planning.planner import Planner
 from dadiff.planning.plans import Plans
 from dadiff.tasks.environments import present
+from dadiff.tasks.task import Steering
 
 if TYPE_CHECKING:
     from matplotlib.animation import AbstractMovieWriter
@@ -35,6 +36,7 @@ class Scene:
         waypoints, discs: (k, 3), as x, y, t / T and x, y, r.
         labels: of the axes.
         time_step: seconds between two frames.
+        frames: rendered pictures of the first plan, (T+1, height, width, 3), or None.
     """
 
     planned: np.ndarray = field(repr=False)
@@ -43,8 +45,9 @@ class Scene:
     target: np.ndarray | None
     waypoints: np.ndarray
     discs: np.ndarray
-    labels: tuple[str, str]
+    labels: Sequence[str]
     time_step: float
+    frames: np.ndarray | None = field(default=None, repr=False)
 
     @classmethod
     def of(cls, planner: Planner, plans: Plans, environment: np.ndarray) -> Scene:
@@ -60,14 +63,15 @@ class Scene:
         outlines = system.outline(executed)
         waypoints, discs = (present(E[name]) if name in E else np.empty((0, 3)) for name in ("waypoints", "obstacles"))
         return cls(
-            _flat(plans.states[..., :2], 2),
-            _flat(executed[..., :2], 2),
+            _flat(system.position(plans.states), 2),
+            _flat(system.position(executed), 2),
             _flat(outlines, 3),
-            E["target"][:2] if "target" in E else None,
+            _target(planner, environment),
             waypoints,
             discs,
-            (plans.columns("x")[0], plans.columns("x")[1]),
+            (system.plane or plans.columns("x"))[:2],
             plans.time_step or 1 / PER_SECOND,
+            system.frames(executed.reshape(-1, *executed.shape[-2:])[0]),
         )
 
     @property
@@ -78,6 +82,15 @@ class Scene:
         seen = seen[np.isfinite(seen).all(axis=-1)]
         low, high = seen.min(axis=0), seen.max(axis=0)
         return (low + high) / 2, 0.55 * max(float((high - low).max()), 0.5)
+
+
+def _target(planner: Planner, environment: np.ndarray) -> np.ndarray | None:
+    """Where the robot should come, (2,), of E (c,)."""
+    if isinstance(planner.task, Steering):
+        goal = planner.task.goal(planner.system, environment)
+        return planner.system.position(goal).reshape(-1, 2)[0]
+    E = planner.condition.unpack(environment)
+    return E["target"][:2] if "target" in E else None
 
 
 def _flat(array: np.ndarray, kept: int) -> np.ndarray:
@@ -109,9 +122,13 @@ def drawn(scene: Scene) -> tuple[Figure, Callable[[int], None]]:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(SIDE, SIDE), layout="constrained")
+    columns = 1 if scene.frames is None else 2
+    figure = Figure(figsize=(columns * SIDE, SIDE), layout="constrained")
     FigureCanvasAgg(figure)
-    axes = figure.subplots()
+    axes, *beside = figure.subplots(1, columns, squeeze=False)[0]
+    pictures = [(ax.imshow(scene.frames[0]), scene.frames) for ax in beside if scene.frames is not None]
+    for ax in beside:
+        ax.set_axis_off()
     _surroundings(axes, scene)
     dot = scene.outlines.shape[-2] == 1
     moving = []
@@ -125,6 +142,8 @@ def drawn(scene: Scene) -> tuple[Figure, Callable[[int], None]]:
         for trail, executed, body, outline in moving:
             trail.set_data(*executed[: t + 1].T)
             body.set_data(*outline[t].T)
+        for picture, frames in pictures:
+            picture.set_data(frames[t])
         axes.set_title(f"{t * scene.time_step:.2f} s")
 
     return figure, update

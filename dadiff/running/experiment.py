@@ -310,9 +310,9 @@ def examples(experiment: Experiment, plans: Plans) -> dict[str, np.ndarray]:
 
 
 def _outlines(system: System, rollout: np.ndarray) -> dict[str, np.ndarray]:
-    """`outlines` of the robot along rollout_states (..., T+1, n), if it is more than a point."""
+    """`outlines` of the robot along rollout_states (..., T+1, n), if it is more than a point where the states say."""
     found = system.outline(rollout)
-    return {"outlines": found} if found.shape[-2] > 1 else {}
+    return {"outlines": found} if found.shape[-2] > 1 and not system.plane else {}
 
 
 def _replayed(system: System, layout: TrajectoryLayout, planned: np.ndarray, x_init: np.ndarray) -> np.ndarray:

@@ -72,6 +72,8 @@ class Robots(System):
 class LinearRobots(Linear, Robots):
     """A fleet of linear systems."""
 
+    take = Robots.take
+
     def _taken(self, index: Sequence[int] | np.ndarray) -> dict[str, Any]:
         arrays = {name: getattr(self, name)[index] for name in ("A", "B", "c")}
         return {**arrays, "robots": arrays["A"].shape[:1]}

@@ -7,7 +7,9 @@ A fleet of 30 and a system that varies over 30 steps have arrays of the same sha
 from __future__ import annotations
 
 from abc import abstractmethod
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Self
 
 import numpy as np
 
@@ -106,6 +108,13 @@ class Linear(AffineSystem):
                 f"is {self.robots[0] if self.robots else None}; for {count} robots give robots={count}, "
                 f"for matrices that vary over T = {count} steps use TimeVarying"
             )
+
+    def take(self, index: Sequence[int] | np.ndarray) -> Self:
+        """See `System.take`."""
+        if not self.robots:
+            return super().take(index)
+        A, B, c = self.A[index], self.B[index], self.c[index]
+        return replace(self, A=A, B=B, c=c, robots=A.shape[:1])
 
     def at(self, t: Times) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """A, B and c, whatever the time."""

@@ -28,7 +28,9 @@ MOST_FILE = 256 * 2**20
 
 SUFFIX = ".xml"
 FOLDERS = ("meshdir", "texturedir", "assetdir")
-KINDS = {2: ("m", "m/s"), 3: ("rad", "rad/s")}  # mjJNT_SLIDE, mjJNT_HINGE -> units of position and velocity
+SLIDE, HINGE = 2, 3  # of mjtJoint
+KINDS = {SLIDE: ("m", "m/s"), HINGE: ("rad", "rad/s")}  # units of position and velocity
+LONG = (3, 5)  # of mjtGeom: capsules and cylinders
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ import numpy as np
 from dadiff import threads
 from dadiff.errors import ConfigError
 from dadiff.outside import digest_of
-from dadiff.systems import mjcf
+from dadiff.systems import mjcf, rendering
 from dadiff.systems.families import Family, Ranges, Robots
 from dadiff.systems.mjcf import Mjcf
 from dadiff.systems.nonlinear import affine
@@ -107,6 +107,24 @@ class MujocoRobot(System):
         J = (following[:, 1:] - following[:, :1]).swapaxes(-1, -2) / h
         J = J.reshape(*lead, n, size)
         return affine(J[..., :n], J[..., n:], following[:, 0].reshape(*lead, n), x, u)
+
+    def outline(self, states: np.ndarray) -> np.ndarray:
+        """See `dadiff.systems.rendering`."""
+        points = rendering.outline(self._model, states.reshape(-1, self.state_dim))
+        return points.reshape(*states.shape[:-1], *points.shape[1:])
+
+    def position(self, states: np.ndarray) -> np.ndarray:
+        """The end of its outline."""
+        return self.outline(states)[..., -1, :]
+
+    @property
+    def plane(self) -> tuple[str, ...]:
+        """Two axes of the world."""
+        return tuple(f"{rendering.WORLD[k]} [m]" for k in rendering.plane_of(self._model))
+
+    def frames(self, states: np.ndarray) -> np.ndarray | None:
+        """Rendered where EGL or OSMesa is installed."""
+        return rendering.frames(self._model, states)
 
     def _stepped(self, points: np.ndarray) -> np.ndarray:
         """States (N, n) after [x; u] (N, n + m), the robots one after the other."""

@@ -198,9 +198,22 @@ class System(ABC):
     def outline(self, states: np.ndarray) -> np.ndarray:
         """What a picture shows of the robot at states (..., n): a line through points (..., k, 2) of the plane.
 
-        The plane is that of the first two states; one point where nothing is known of the robot's shape.
+        One point where nothing is known of the robot's shape.
         """
         return states[..., None, :2]
+
+    def position(self, states: np.ndarray) -> np.ndarray:
+        """Where a picture follows the robot at states (..., n), (..., 2), in the plane of its outline."""
+        return states[..., :2]
+
+    @property
+    def plane(self) -> tuple[str, ...]:
+        """What the two axes of that plane are called; () where it is that of the first two states."""
+        return ()
+
+    def frames(self, states: np.ndarray) -> np.ndarray | None:
+        """Rendered pictures (N, height, width, 3), uint8, of states (N, n); None where nothing renders them."""
+        return None
 
     def take(self, index: Sequence[int] | np.ndarray) -> Self:
         """The robots at `index`, as a system of so many.
