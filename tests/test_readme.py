@@ -1,5 +1,6 @@
 """Every command and every example of the README and of docs/ runs."""
 
+import json
 import os
 import re
 import shlex
@@ -10,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from dadiff.errors import ConfigError
+from dadiff.reporting import cli as reporting
 from dadiff.reporting import publishing
 from dadiff.reporting.claims import read_ledger
 from dadiff.reporting.definitions import FOLDER
@@ -128,6 +130,20 @@ def test_what_is_published_is_whole_small_and_knows_no_place():
         assert f"`{name}`" in TEXTS["docs/results.md"]
     for path in files:
         assert not re.search(r"(?<![\w.])/(tmp|home|root|work)/", path.read_text())
+
+
+def test_an_own_figure_is_drawn_as_written(tmp_path, monkeypatch, capsys):
+    write_own_files(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("DADIFF_COMPONENTS", "")
+    (said,) = re.findall(r"`dadiff-report lqr_quick (--definition \S+) --components mylab`", TEXTS["docs/extending.md"])
+    store = str(ROOT / "tests" / "data" / "store")
+    command = ["lqr_made_up", *said.split(), "--output-dir", store, "--out", "out"]
+    assert reporting.main(command) == 1
+    assert "trust it with --components mylab" in capsys.readouterr().err
+    assert reporting.main([*command, "--components", "mylab"]) == 0
+    assert (tmp_path / "out" / "figures" / "best.svg").is_file()
+    assert json.loads((tmp_path / "out" / "report.json").read_text())["figures"]["best"]["content"]["lowest"]
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)

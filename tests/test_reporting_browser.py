@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shutil
+import subprocess
+import tarfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,6 +17,7 @@ pytestmark = pytest.mark.slow
 
 STORE = Path(__file__).parent / "data" / "store"
 PHONE, PAGE = (390, 800), (1100, 900)
+AXE = "axe-core@4.14.1"
 
 
 @pytest.fixture(scope="module")
@@ -99,6 +102,51 @@ def test_both_schemes_are_readable(browser, page):
     for page_colour, ink in colours.values():
         assert contrast(page_colour, ink) > 7
     assert colours["light"] != colours["dark"]
+
+
+TEXTS = """
+document.querySelectorAll('details').forEach(d => d.open = true);
+const seen = e => e.getClientRects().length && !e.closest('.hidden');
+const words = e => [...e.childNodes].filter(n => n.nodeType === 3).map(n => n.textContent).join('').trim();
+return [...document.querySelectorAll('main *')].filter(e => seen(e) && words(e) && words(e) !== '\u25a0').map(e => {
+  const look = getComputedStyle(e);
+  let behind = e;
+  while (behind && /, 0\\)$|transparent/.test(getComputedStyle(behind).backgroundColor)) behind = behind.parentElement;
+  return [words(e), e instanceof SVGElement ? look.fill : look.color,
+          getComputedStyle(behind || document.body).backgroundColor];
+})"""
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_every_text_stands_out(browser, page, scheme):
+    show(browser, page, PAGE, scheme)
+    texts = browser.execute_script(TEXTS)
+    assert len(texts) > 50
+    assert [text for text in texts if contrast(text[1], text[2]) < 4.5] == []
+
+
+@pytest.fixture(scope="module")
+def axe(tmp_path_factory) -> str:
+    """The accessibility checks of axe-core, from the npm registry."""
+    folder = tmp_path_factory.mktemp("axe")
+    npm = shutil.which("npm")
+    fetched = npm and subprocess.run(
+        [npm, "pack", "--silent", AXE], cwd=folder, capture_output=True, timeout=120, check=False
+    )
+    if not fetched or fetched.returncode:
+        pytest.skip("npm does not give axe-core")
+    with tarfile.open(next(folder.glob("*.tgz"))) as archive:
+        return archive.extractfile("package/axe.min.js").read().decode()
+
+
+@pytest.mark.parametrize("size", [PHONE, PAGE])
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_axe_finds_nothing(browser, page, axe, scheme, size):
+    show(browser, page, size, scheme)
+    browser.execute_script("document.querySelectorAll('details').forEach(d => d.open = true)")
+    browser.execute_script(axe)
+    found = browser.execute_async_script("axe.run().then(arguments[0])")
+    assert [(rule["id"], rule["nodes"][0]["html"]) for rule in found["violations"]] == []
 
 
 def test_a_legend_entry_hides_its_method_in_all_figures(browser, page):

@@ -22,7 +22,7 @@ def trusted() -> tuple[str, ...]:
 
 def trust(packages: Iterable[str]) -> None:
     """Trust packages from now on, in this process and those that it starts."""
-    os.environ[VARIABLE] = ",".join(dict.fromkeys([*trusted(), *packages]))
+    os.environ[VARIABLE] = ",".join(dict.fromkeys(filter(None, [*trusted(), *packages])))
 
 
 def check_trusted(components: Sequence[str]) -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from dadiff.commands import reported
+from dadiff.config.trust import trust
 from dadiff.store import Results, Sweeps
 from dadiff.tracking import Tracking
 
@@ -24,6 +25,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--against",
         help="another sweep, or the folder of a report: each number within or outside of its interval there",
+    )
+    parser.add_argument(
+        "--components", default="", help="packages besides dadiff whose figures a definition may name: mylab,other"
     )
     parser.add_argument("--out", type=Path, help="folder to write (default: <output-dir>/reports/<sweep>)")
     parser.add_argument(
@@ -40,6 +44,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Write one report; 0 if it was written."""
     logging.basicConfig(format="%(message)s")
     options = _parser().parse_args(arguments)
+    trust(options.components.split(","))
     return reported("dadiff-report", lambda: print("\n".join(said(write(options), options))))
 
 
@@ -114,7 +119,9 @@ def _again(options: argparse.Namespace, definition: str) -> str:
     """The command that writes the report again from the same results."""
     from dadiff.outside import without_passwords
 
-    command = ["dadiff-report", *options.sweep, "--definition", definition]
+    command = ["dadiff-report", *options.sweep, "--definition", options.definition or definition]
+    if options.components:
+        command += ["--components", options.components]
     if options.output_dir != Path("outputs"):
         command += ["--output-dir", str(options.output_dir)]
     if options.tracking_uri is not None:

@@ -3,7 +3,8 @@
 title, about        words
 sweeps              patterns of sweep names that this definition is for
 claims              ids of the ledger; absent: all of them
-figures             id, kind (a module of `dadiff.reporting.figures`), title, caption, options
+figures             id, kind (a module of `dadiff.reporting.figures`, or the dotted name of an own class), title,
+                    caption, options
 tables              id, title, caption, options
 """
 
@@ -54,11 +55,37 @@ class Item:
 
 
 def _figure(kind: str, item: str) -> Callable[..., Any]:
+    if "." in kind:
+        return _own_figure(kind, item)
     kinds = sorted(module.name for module in pkgutil.iter_modules(figures.__path__) if module.name != "style")
     if kind not in kinds:
-        raise ConfigError(f"report item {item}: unknown kind {kind!r}; expected {', '.join(kinds)}")
+        raise ConfigError(
+            f"report item {item}: unknown kind {kind!r}; expected {', '.join(kinds)}, or the dotted name of a class"
+        )
     module = importlib.import_module(f"{figures.__name__}.{kind}")
     return module.collect
+
+
+def _own_figure(kind: str, item: str) -> Callable[..., Any]:
+    """`collect` of a class that the user trusts: it makes the figure, which has `runs`, `notes` and `draw(columns)`."""
+    from dadiff.config.own import load as load_module
+    from dadiff.config.trust import VARIABLE, trusted
+
+    module, _, name = kind.rpartition(".")
+    package = module.partition(".")[0]
+    if package not in trusted():
+        raise ConfigError(
+            f"report item {item}: kind {kind!r} is of a package that you did not name; trust it with "
+            f"--components {package}, or by {VARIABLE}={package}"
+        )
+    try:
+        found = getattr(load_module(module), name)
+    except (ModuleNotFoundError, AttributeError) as error:
+        raise ConfigError(f"report item {item}: kind {kind!r} cannot be found ({error}); write module.Class") from None
+    if not all(callable(getattr(found, part, None)) for part in ("collect", "draw")):
+        raise ConfigError(f"report item {item}: kind {kind!r} is no figure; a class with collect and draw is one")
+    collect: Callable[..., Any] = found.collect
+    return collect
 
 
 @dataclass(frozen=True)

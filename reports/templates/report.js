@@ -14,6 +14,7 @@ function toggle(method) {
   }
 }
 for (const entry of all("[data-choice]")) {
+  entry.closest("svg").setAttribute("role", "group"); // an image has no switches inside
   entry.setAttribute("tabindex", "0");
   entry.setAttribute("role", "button");
   entry.setAttribute("aria-label", "show or hide " + entry.dataset.choice);
