@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,6 +25,7 @@ from dadiff.reporting.figures.style import render as render_figure
 from dadiff.reporting.report import Part, Report
 from dadiff.reporting.statistics import Estimate
 from dadiff.reporting.story import Line
+from dadiff.threads import cores
 
 FORMS = {"tables": ("csv", "tex"), "figures": ("pdf", "svg", "png")}
 WIDE, NARROW = 2, 1
@@ -57,6 +59,16 @@ def draw(part: Part) -> Drawing:
         if found
     ]
     return Drawing(files, Markup("").join(drawn))
+
+
+def draw_all(parts: Sequence[Part]) -> dict[str, Drawing]:
+    """All figures by their id, drawn in as many processes as there are cores; each alone, so that bytes are the same."""
+    names = [part.item.id for part in parts]
+    workers = min(cores(), len(parts))
+    if workers < 2:
+        return dict(zip(names, map(draw, parts), strict=True))
+    with ProcessPoolExecutor(workers) as pool:
+        return dict(zip(names, pool.map(draw, parts), strict=True))
 
 
 def untagged(svg: bytes) -> bytes:

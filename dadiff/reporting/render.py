@@ -19,7 +19,7 @@ from dadiff.reporting import configurations, published, publishing, slim, story
 from dadiff.reporting.claims import Verdict, read_ledger
 from dadiff.reporting.definitions import FOLDER
 from dadiff.reporting.latex import to_latex
-from dadiff.reporting.page import FORMS, draw, to_html, untagged
+from dadiff.reporting.page import FORMS, draw_all, to_html, untagged
 from dadiff.reporting.report import Part, Report
 from dadiff.reporting.tables import to_csv
 from dadiff.store.files import make_folder, strict
@@ -36,7 +36,7 @@ def render(report: Report, folder: Path) -> Path:
     for part in FORMS:
         make_folder(folder / part)
     older = _parts_in(folder)
-    drawings = {part.item.id: draw(part) for part in report.figures if not part.empty}
+    drawings = draw_all([part for part in report.figures if not part.empty])
     try:
         _write_tables(report, folder / "tables")
         for name, drawing in drawings.items():
