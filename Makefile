@@ -50,7 +50,7 @@ lint: .venv/checks
 	$(RUN)/mypy
 
 bench: .venv/checks
-	$(RUN)/python -m bench
+	$(RUN)/python -m bench --out $(OUTPUTS)
 
 mutants: .venv/checks
 	$(RUN)/python tools/mutants.py

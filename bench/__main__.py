@@ -1,23 +1,26 @@
 """All measurements, each beside a peer or a floor from the same run: `make bench`. Leave the machine alone meanwhile.
 
-    python -m bench [part ...]      # learning planning optima one_plan projecting overhead nonlinear projections
+    python -m bench [--out FOLDER] [part ...]
 
-Prints a table, and writes `outputs/bench.json` and `outputs/bench.svg`.
+Prints a table, and writes it with the figure to `bench.json`, `bench.md` and `bench.svg` in the folder (outputs).
+`nonlinear` and `projections` are parts of their own, which only print what they find.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
-import platform
 import subprocess
 import sys
+from collections.abc import Sequence
 from dataclasses import asdict
 from importlib import import_module
 from pathlib import Path
 
+from bench.machine import described
 from bench.rows import Row
-from bench.show import draw, table
+from bench.show import draw, markdown, table
 from dadiff import threads
 
 PARTS = {  # part: threads; None leaves them to torch
@@ -27,32 +30,41 @@ PARTS = {  # part: threads; None leaves them to torch
     "one_plan": 1,
     "projecting": 1,
     "overhead": None,
+    "reports": None,
 }
-PRINTING = ("nonlinear", "projections")  # these print what they find; one thread
-OUTPUTS = Path("outputs")
+PRINTING = ("nonlinear", "projections")
+"""One thread; a minute or more each."""
 
 
 def main() -> None:
     """Measure every part in a process of its own."""
     threads.settle()
-    if len(sys.argv) == 3 and sys.argv[1] == "--part":
-        rows = import_module(f"bench.{sys.argv[2]}").measure()
-        print(json.dumps([asdict(row) for row in rows]))
+    parser = argparse.ArgumentParser("python -m bench")
+    parser.add_argument("parts", nargs="*", choices=[[], *PARTS, *PRINTING], help="all but those that print")
+    parser.add_argument("--out", type=Path, default=Path("outputs"), help="folder to write to (outputs)")
+    parser.add_argument("--part", help=argparse.SUPPRESS)
+    given = parser.parse_args()
+    if given.part:
+        print(json.dumps([asdict(row) for row in import_module(f"bench.{given.part}").measure()]))
         return
-    before, rows = os.getloadavg()[0], []
-    for part in sys.argv[1:] or [*PARTS, *PRINTING]:
+    measure(given.parts or list(PARTS), given.out)
+
+
+def measure(parts: Sequence[str], folder: Path) -> None:
+    """Print and write what the parts find."""
+    machine, rows = described(), list[Row]()
+    for part in parts:
         print(f"measuring: {part}", file=sys.stderr, flush=True)
         if part in PRINTING:
             subprocess.run([sys.executable, "-m", f"bench.{part}"], check=True, env=os.environ | threads.limits(1))
         else:
             rows += measured(part)
-    machine = {"cores": threads.cores(), "processor": platform.processor() or platform.machine(), "load_before": before}
-    OUTPUTS.mkdir(exist_ok=True)
+    folder.mkdir(exist_ok=True)
     shown = [asdict(row) | {"ratio": row.ratio} for row in rows]
-    (OUTPUTS / "bench.json").write_text(json.dumps({"machine": machine, "rows": shown}, indent=1) + "\n")
-    draw(rows, OUTPUTS / "bench.svg")
-    print(table(rows))
-    print(f"on {machine['cores']} cores, load {before:.1f} before; written to {OUTPUTS / 'bench.json'} and bench.svg")
+    (folder / "bench.json").write_text(json.dumps({"machine": machine, "rows": shown}, indent=1) + "\n")
+    (folder / "bench.md").write_text(markdown(rows, machine))
+    draw(rows, folder / "bench.svg")
+    print(f"{table(rows)}\n{machine}\nwritten to {folder}: bench.json, bench.md, bench.svg")
 
 
 def measured(part: str) -> list[Row]:

@@ -14,9 +14,24 @@ FEW += ["evaluation.samples=2", "schedule.num_steps=30"]
 
 
 def dadiff(folder: str, *words: str) -> float:
-    """Seconds of one command."""
+    """Seconds of one command.
+
+    Raises:
+        RuntimeError: with what it said, if it failed.
+    """
     command = [sys.executable, "-m", "dadiff", "-m", "denoiser=gaussian", f"output_dir={folder}", *words]
-    return seconds(lambda: subprocess.run(command, check=True, capture_output=True))
+    return seconds(lambda: finished(command))
+
+
+def finished(command: list[str]) -> None:
+    """Run a command to its end.
+
+    Raises:
+        RuntimeError: with what it said, if it failed.
+    """
+    done = subprocess.run(command, check=False, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    if done.returncode:
+        raise RuntimeError(f"{' '.join(command[2:])}: {done.stderr[-2000:]}")
 
 
 def measure() -> list[Row]:

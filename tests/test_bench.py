@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from bench.peers import ConvolutionNetwork, ancestral_chain
 from bench.rows import Row, least
-from bench.show import draw, slope, table
+from bench.show import draw, markdown, slope, table
 from dadiff.diffusion.schedule import paper_linear
 from dadiff.trajectory import TrajectoryLayout
 
@@ -35,8 +36,18 @@ def test_table_figure_and_file_hold_every_row(tmp_path):
     assert "3.00" in shown
     assert "exponent 2.00" in shown
     assert Row(**json.loads(json.dumps(asdict(ROWS[0])))) == ROWS[0]
+    shown = markdown(ROWS, "2 cores, load 0.0 before")
+    assert "| a step | 2 ms | 6 ms | 3.00 | a slower one |" in shown
+    assert "load 0.0 before" in shown
     draw(ROWS, tmp_path / "bench.svg")
     assert (tmp_path / "bench.svg").read_text().count("a slower one") >= 1
+
+
+def test_the_published_table_is_that_of_the_published_numbers():
+    docs = Path(__file__).parent.parent / "docs"
+    told = json.loads((docs / "bench.json").read_text())
+    rows = [Row(**{name: value for name, value in row.items() if name != "ratio"}) for row in told["rows"]]
+    assert (docs / "bench.md").read_text() == markdown(rows, told["machine"])
 
 
 def test_least_takes_actions_in_turn():

@@ -10,12 +10,15 @@ from __future__ import annotations
 
 import math
 import re
+from collections import defaultdict
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from pandas.api.types import is_numeric_dtype
 
 from dadiff.errors import StoreError
 from dadiff.reporting.selection import Selector, matches
@@ -147,12 +150,13 @@ class Evidence:
     @cached_property
     def all_methods(self) -> list[Method]:
         """Every method of the sweep, in its order."""
-        groups: dict[str, Method] = {}
+        groups, seen = dict[str, Method](), set[tuple[str, str]]()
         for cell in self.sweep.cells:
             axes = shared_axes(cell)
-            method = groups.setdefault(repr(sorted(axes.items())), Method(axes, []))
-            if cell.key not in [other.key for other in method.cells]:
+            method = groups.setdefault(name := repr(sorted(axes.items())), Method(axes, []))
+            if (name, cell.key) not in seen:
                 method.cells.append(cell)
+            seen.add((name, cell.key))
         return list(groups.values())
 
     def methods(self, cells: Selector) -> list[Method]:
@@ -218,13 +222,30 @@ def _objects(cells: list[ReportedRun]) -> np.ndarray:
 
 
 def pairs(method: Method, other: Method) -> list[tuple[ReportedRun, ReportedRun]]:
-    """Finished runs of both that are of the same draw."""
-    return [(a, b) for a in method.finished for b in other.finished if _same_draw(a, b)]
+    """Finished runs of both that are of the same draw: alike in every seed that applies to both."""
+    own, theirs = _by_seeds(method.finished), _by_seeds(other.finished)
+    return [
+        two
+        for names, cells in own.items()
+        for applying, others in theirs.items()
+        for two in _joined(cells, others, [name for name in names if name in applying])
+    ]
 
 
-def _same_draw(a: ReportedRun, b: ReportedRun) -> bool:
-    shared = [name for name in a.axes if is_seed(name) and b.axes.get(name) is not None]
-    return all(a.axes[name] in (b.axes[name], None) for name in shared)
+def _by_seeds(cells: list[ReportedRun]) -> dict[tuple[str, ...], list[ReportedRun]]:
+    """Cells by the names of the seeds that apply to them."""
+    found: dict[tuple[str, ...], list[ReportedRun]] = {}
+    for cell in cells:
+        found.setdefault(tuple(seeds_of(cell)), []).append(cell)
+    return found
+
+
+def _joined(cells: list[ReportedRun], others: list[ReportedRun], names: list[str]) -> Iterator[tuple[ReportedRun, ReportedRun]]:
+    """Each cell with the others that are alike in some axes."""
+    alike = defaultdict[tuple[Any, ...], list[ReportedRun]](list)
+    for other in others:
+        alike[tuple(other.axes[name] for name in names)].append(other)
+    return ((cell, other) for cell in cells for other in alike[tuple(cell.axes[name] for name in names)])
 
 
 def seeds_of(cell: ReportedRun) -> dict[str, Any]:
@@ -296,8 +317,7 @@ def _episodes(cell: ReportedRun, wanted: re.Match[str]) -> np.ndarray:
 def _of_cell(cell: ReportedRun, metric: str, group: str | None) -> np.ndarray:
     if name := _table_with(cell, metric):
         if (name, metric) not in cell.means:
-            values = dense(cell.table(name), metric, where=f"run {cell.key}, {name}")
-            cell.means[name, metric] = values.mean(axis=-2 if name == "per_step" else -1)
+            cell.means.update(_means(cell, name))
         means = cell.means[name, metric]
         return means if group is None else means[_robots_in(cell, group)]
     if metric not in cell.metrics:
@@ -306,6 +326,14 @@ def _of_cell(cell: ReportedRun, metric: str, group: str | None) -> np.ndarray:
         values = _episodes(cell, wanted)
         return values if group is None else values[_robots_in(cell, group)]
     return np.asarray(cell.metrics[metric], dtype=np.float64)
+
+
+def _means(cell: ReportedRun, name: str) -> dict[tuple[str, str], np.ndarray]:
+    """Of every metric of a table, which is read once for all of them, means over the plans of each case."""
+    table = cell.table(name)
+    metrics = [column for column in table.columns if column not in LEVELS and is_numeric_dtype(table[column])]
+    values = dense(table, metrics, where=f"run {cell.key}, {name}").mean(axis=-3 if name == "per_step" else -2)
+    return {(name, metric): values[..., k] for k, metric in enumerate(metrics)}
 
 
 def _robots_in(cell: ReportedRun, group: str) -> np.ndarray:
@@ -319,8 +347,8 @@ def has_metric(cells: list[ReportedRun], metric: str) -> bool:
     return all(metric in cell.metrics or _table_with(cell, metric) for cell in cells)
 
 
-def dense(table: pd.DataFrame, column: str, *, where: str) -> np.ndarray:
-    """A column of a long table as an array over its index columns: ([robot,] case, sample[, t]).
+def dense(table: pd.DataFrame, columns: str | list[str], *, where: str) -> np.ndarray:
+    """Columns of a long table as an array over its index columns: ([robot,] case, sample[, t][, column]).
 
     Raises:
         StoreError: if a combination of indices is missing or comes twice.
@@ -333,9 +361,10 @@ def dense(table: pd.DataFrame, column: str, *, where: str) -> np.ndarray:
         raise StoreError(
             f"{where}: has {len(table)} rows for {dict(zip(index, shape, strict=True))}; expected each once"
         )
-    values = np.empty(len(table))
-    values[place] = table[column]
-    return values.reshape(shape)
+    found = table[columns].to_numpy(dtype=np.float64)
+    values = np.empty_like(found)
+    values[place] = found
+    return values.reshape(*shape, *found.shape[1:])
 
 
 def varying(methods: list[Method]) -> list[str]:

@@ -62,7 +62,7 @@ def draw(part: Part) -> Drawing:
 
 
 def draw_all(parts: Sequence[Part]) -> dict[str, Drawing]:
-    """All figures by their id, drawn in as many processes as there are cores; each alone, so that bytes are the same."""
+    """All figures by their id, in as many processes as there are cores; the bytes are those of one process."""
     names = [part.item.id for part in parts]
     workers = min(cores(), len(parts))
     if workers < 2:

@@ -18,7 +18,7 @@ import pandas as pd
 
 from dadiff.errors import StoreError
 from dadiff.store import Record, Results, StoredRun, Sweeps
-from dadiff.store.results import read_table
+from dadiff.store.results import columns_of, read_table
 from dadiff.tracking.links import pages, table
 
 
@@ -27,9 +27,9 @@ def _table(folder: Path, name: str) -> pd.DataFrame:
     return read_table(folder, name)
 
 
-@lru_cache(maxsize=4096)
+@lru_cache(maxsize=65536)
 def _columns(folder: Path, name: str) -> tuple[str, ...]:
-    return tuple(_table(folder, name).columns)
+    return columns_of(folder, name)
 
 
 LOG = re.compile(r"; log: \S+$")
