@@ -13,7 +13,7 @@ from pathlib import Path
 from bench.overhead import dadiff, finished
 from bench.rows import Row, seconds
 from dadiff.running.digest import digest
-from dadiff.store import Cell, Results, StoredRun, Sweep, Sweeps
+from dadiff.store import Results, StoredRun, Sweep, Sweeps, SweptRun
 from dadiff.store.files import write_json
 
 COUNTS = (500, 2000)
@@ -21,7 +21,7 @@ CALLS = (3, 4, 5, 10, 20)
 TINY = ["dataset.train_size=60", "dataset.test_size=2", "evaluation.samples=2", "schedule.num_steps=30"]
 
 
-def copied(run: StoredRun, output_dir: Path, calls: int, seed: int) -> Cell:
+def copied(run: StoredRun, output_dir: Path, calls: int, seed: int) -> SweptRun:
     """A run as if it had been made with so many calls and another seed."""
     key = digest([run.key, calls, seed])
     axes = {**run.axes, "sampler.num_steps": calls, "seed": seed, "evaluation.seed": seed, "dataset.seed": seed}
@@ -29,12 +29,12 @@ def copied(run: StoredRun, output_dir: Path, calls: int, seed: int) -> Cell:
     folder = Results(output_dir).folder(key)
     shutil.copytree(run.folder, folder)
     write_json(folder / "run.json", replace(run.record, key=key, name=name, axes=axes).to_json())
-    return Cell(key, name, dict(axes), "finished")
+    return SweptRun(key, name, dict(axes), "finished")
 
 
 def store(runs: Sequence[StoredRun], output_dir: Path, count: int) -> str:
     """A sweep of so many copies; returns its name."""
-    cells, seed = list[Cell](), 0
+    cells, seed = list[SweptRun](), 0
     while len(cells) < count:
         cells += [copied(run, output_dir, calls, seed) for run in runs for calls in CALLS]
         seed += 1

@@ -240,7 +240,9 @@ def _by_seeds(cells: list[ReportedRun]) -> dict[tuple[str, ...], list[ReportedRu
     return found
 
 
-def _joined(cells: list[ReportedRun], others: list[ReportedRun], names: list[str]) -> Iterator[tuple[ReportedRun, ReportedRun]]:
+def _joined(
+    cells: list[ReportedRun], others: list[ReportedRun], names: list[str]
+) -> Iterator[tuple[ReportedRun, ReportedRun]]:
     """Each cell with the others that are alike in some axes."""
     alike = defaultdict[tuple[Any, ...], list[ReportedRun]](list)
     for other in others:
