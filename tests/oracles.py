@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
+from dadiff.systems import System
 from dadiff.systems.quadrotors import GRAVITY, PlanarQuadrotor
 from dadiff.trajectory import TrajectoryLayout
 
@@ -14,15 +16,8 @@ from dadiff.trajectory import TrajectoryLayout
 def ipopt(
     robot: PlanarQuadrotor, layout: TrajectoryLayout, W: np.ndarray, reference: np.ndarray, x_init: np.ndarray
 ) -> tuple[float, float]:
-    """The least (tau - reference)' W (tau - reference) over trajectories of a quadrotor within bounds from x_init.
-
-    Returns:
-        The cost, and the processor seconds of solving, without those of writing the problem out.
-    """
+    """See `ipopt_of`, of one quadrotor."""
     import casadi
-
-    problem, h = casadi.Opti(), robot.time_step
-    x, u = problem.variable(6, layout.horizon + 1), problem.variable(2, layout.horizon)
 
     def rate(x: Any, u: Any) -> Any:
         thrust = GRAVITY + robot.thrust_gain * u[0]
@@ -30,6 +25,38 @@ def ipopt(
         upward = thrust * casadi.cos(x[2]) - GRAVITY - robot.drag * x[4]
         return casadi.vertcat(x[3], x[4], x[5], forward, upward, robot.torque_gain * u[1])
 
+    return ipopt_of(robot, rate, layout, W, reference, x_init)
+
+
+def cart_pole_rate(x: Any, u: Any) -> Any:
+    """Of position, angle from upright and their rates; u pushes the cart, 1 kg with a pole of 0.3 kg and 1 m."""
+    import casadi
+
+    sin, cos = casadi.sin(x[1]), casadi.cos(x[1])
+    a = (u[0] + 0.3 * sin * (x[3] ** 2 - GRAVITY * cos)) / (1 + 0.3 * sin**2)
+    return casadi.vertcat(x[2], x[3], a, GRAVITY * sin - cos * a)
+
+
+def ipopt_of(
+    robot: System,
+    rate: Callable[[Any, Any], Any],
+    layout: TrajectoryLayout,
+    W: np.ndarray,
+    reference: np.ndarray,
+    x_init: np.ndarray,
+) -> tuple[float, float]:
+    """The least (tau - reference)' W (tau - reference) over trajectories within a robot's bounds from x_init.
+
+    Args:
+        rate: dx/dt in casadi, integrated by RK4.
+
+    Returns:
+        The cost, and the processor seconds of solving, without those of writing the problem out.
+    """
+    import casadi
+
+    problem, h, n, m = casadi.Opti(), robot.time_step, layout.state_dim, layout.input_dim
+    x, u = problem.variable(n, layout.horizon + 1), problem.variable(m, layout.horizon)
     for t in range(layout.horizon):
         k1 = rate(x[:, t], u[:, t])
         k2 = rate(x[:, t] + h / 2 * k1, u[:, t])
@@ -37,7 +64,7 @@ def ipopt(
         k4 = rate(x[:, t] + h * k3, u[:, t])
         problem.subject_to(x[:, t + 1] == x[:, t] + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4))
     problem.subject_to(x[:, 0] == x_init)
-    for values, (low, high) in ((x[:, 1:], robot.bounds.of_states(6)), (u, robot.bounds.of_inputs(2))):
+    for values, (low, high) in ((x[:, 1:], robot.bounds.of_states(n)), (u, robot.bounds.of_inputs(m))):
         for k in np.flatnonzero(np.isfinite(low) | np.isfinite(high)):
             problem.subject_to(problem.bounded(low[k], values[int(k), :], high[k]))
     states, inputs = layout.split(reference)

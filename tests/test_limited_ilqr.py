@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from oracles import ipopt
+from oracles import cart_pole_rate, ipopt, ipopt_of
 
 from dadiff.behaviours import Known, Limited, Manifold, Pin, pins
 from dadiff.errors import ConfigError
@@ -117,6 +117,29 @@ def test_plans_are_projected_onto_nonlinear_dynamics_within_bounds(weighted, rng
     assert max(exceeded) < 1e-8
     torch.testing.assert_close(project(torch.tensor(z), C), torch.tensor(found))
     np.testing.assert_allclose(project(found, C, found), found, atol=1e-5)
+
+
+def test_a_cart_pole_keeps_its_track_and_its_force(rng):
+    pytest.importorskip("casadi")
+
+    def rate(x, u):
+        sin, cos = x[..., 1].sin(), x[..., 1].cos()
+        a = (u[..., 0] + 0.3 * sin * (x[..., 3] ** 2 - 9.81 * cos)) / (1 + 0.3 * sin**2)
+        return torch.stack([x[..., 2], x[..., 3], a, 9.81 * sin - cos * a], -1)
+
+    track = Bounds(-3.0, 3.0, [-0.25, -np.inf, -np.inf, -np.inf], [0.25, np.inf, np.inf, np.inf])
+    robot = Nonlinear(rate, 4, 1, integrator="rk4", time_step=0.05, bounds=track)
+    layout, x_init = robot.layout(25), rng.uniform(-0.1, 0.1, (4, 4))
+    metric = Metric.diagonal(layout, np.tile([1.0], layout.size))
+    given = LimitedTracking.by_bounds(robot, metric, 0.2 * rng.standard_normal((4, layout.size)), x_init)
+    found = solve(given)
+    states, inputs = layout.split(found.tau)
+    assert found.converged.all()
+    assert np.abs(inputs).max() == 3.0
+    assert np.abs(states[..., 0]).max() <= 0.25 + 1e-8
+    for k in range(4):
+        best = ipopt_of(robot, cart_pole_rate, layout, np.eye(layout.size), given.reference[k], x_init[k])[0]
+        assert found.cost[k] == pytest.approx(best, rel=1e-6)
 
 
 def test_one_robot_of_one_input_keeps_clear_of_a_disc_on_curved_dynamics(rng):
