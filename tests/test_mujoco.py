@@ -259,8 +259,9 @@ def test_a_recording_about_a_feedback_stays_where_the_robot_rests_and_obeys_it()
 TINY = ["task.robots=3", "task.interpolation=2", "task.horizon=8", "dataset.train_size=4", "dataset.test_size=2"]
 TINY += ["training.steps=5", "denoiser.width=8", "denoiser.blocks=1", "sampler.num_steps=2", "progress=false"]
 TERMS = ["projector.initial_state=fixed", "projector.features=[constant,identity,trigonometric,control_affine]"]
+EPISODES = ["evaluation.replan_every=[4]", "evaluation.steps=8", "evaluation.disturbance=0.001"]
 LEARNED = {
-    "known_fixed": [],
+    "known_fixed": ["projector.bounds=enforced", "evaluation=closed_loop", *EPISODES],
     "identified": [*TERMS, "projector.angles=[1]", "projector.ridge=1e-8"],
     "koopman": [],
     "hankel_lowrank": ["projector.initial_state=fixed", "projector.offset=estimated"],
@@ -277,6 +278,10 @@ def test_a_run_plans_and_replays_in_the_simulator(task, projector, tmp_path, mon
     assert metrics["initial_state_error"] < 1e-12
     if projector == "known_fixed":
         assert metrics["gap_nrmse"] < 1e-6
+        assert metrics["violation"] == 0
+        assert 0.5 < metrics["closed_loop_receding_4"] < 2
+    else:
+        assert metrics["prediction_error"] < 0.1
     assert Planner.load(run.folder).system.robots == (2,)
 
 

@@ -140,7 +140,8 @@ class MujocoRobot(System):
         n = self.state_dim
         states = np.concatenate([np.zeros((len(points), 1)), points[:, :n]], axis=-1)  # time comes first
         inputs = np.repeat(points[:, None, n:], self.frame_skip, axis=1)
-        workers = 0 if len(points) <= ALONE else threads.own()
+        workers = threads.own() if len(points) > ALONE else 1
+        workers = workers if workers > 1 else 0  # which is the calling thread itself
         with self._memory.lent(self._model, workers) as data:
             reached, _ = _pool(os.getpid(), workers).rollout(models, data, states, inputs)
         return reached[:, -1, 1:]
