@@ -48,10 +48,12 @@ def main(count: int = 1000, oracle_count: int = 20) -> None:
         plans = solve(problem, sweeps=1).tau
         each = seconds(lambda problem=problem, plans=plans: solve(problem, plans, sweeps=1)) / count
         print(f"one sweep, metric {name}: {1e3 * each:.3f} ms a plan in a batch of {count}")
-        found = solve(problem, plans)
-        print(f"  to the end: {found.sweeps.mean():.1f} sweeps, converged {found.converged.mean():.1%}")
+        found = solve(problem)
+        whole = seconds(lambda problem=problem: solve(problem), 1) / count
+        share = found.converged.mean()
+        print(f"  to the end: {found.sweeps.mean():.1f} sweeps, {1e3 * whole:.2f} ms; {share:.1%} converge")
         if U is None:
-            compare(robots, problem, found.cost, oracle_count, each)
+            compare(robots, problem, found.cost, oracle_count, each, whole)
     alone = task.target(PlanarQuadrotors()).take([0])
     problem = Tracking(alone, Metric.diagonal(layout, scale**2), reference[:1], cases.x_init[:1])
     print(f"one sweep of one plan alone: {1e3 * seconds(lambda: solve(problem, sweeps=1)):.1f} ms")
@@ -61,18 +63,27 @@ def main(count: int = 1000, oracle_count: int = 20) -> None:
     print(f"expert: {1e3 * expert:.2f} ms a demonstration, {1e4 * expert:.0f} s for 10,000")
 
 
-def compare(robots: PlanarQuadrotor, problem: Tracking, cost: np.ndarray, count: int, each: float) -> None:
-    """IPOPT on the first plans."""
+def compare(
+    robots: PlanarQuadrotor, problem: Tracking, cost: np.ndarray, count: int, each: float, whole: float
+) -> None:
+    """IPOPT on the first plans: with casadi's graph written out, and as casadi does it unless told otherwise.
+
+    Args:
+        each, whole: seconds of a sweep, and of as many as are needed, a plan.
+    """
     metric, layout = problem.metric, problem.layout
     W = np.diag(metric.times(np.ones(layout.size)))
-    solved = []
-    for k in range(count):
-        gains = (float(value[k]) for value in (robots.thrust_gain, robots.torque_gain, robots.drag))
-        robot = PlanarQuadrotor(**dict(zip(("thrust_gain", "torque_gain", "drag"), gains, strict=True)))
-        solved.append(ipopt(robot, layout, W, problem.reference[k, 0], problem.x_init[k, 0]))
-    costs, taken = np.array(solved).T
-    apart, slow = np.abs(cost[:count, 0] / costs - 1).max(), np.median(taken)
-    print(f"  ipopt: median {1e3 * slow:.1f} ms, as long as {slow / each:.0f} sweeps; costs apart {apart:.1e}")
+    for expand in (True, False):
+        solved = []
+        for k in range(count):
+            gains = (float(value[k]) for value in (robots.thrust_gain, robots.torque_gain, robots.drag))
+            robot = PlanarQuadrotor(**dict(zip(("thrust_gain", "torque_gain", "drag"), gains, strict=True)))
+            solved.append(ipopt(robot, layout, W, problem.reference[k, 0], problem.x_init[k, 0], expand=expand))
+        costs, taken = np.array(solved).T
+        apart, slow = np.abs(cost[:count, 0] / costs - 1).max(), np.median(taken)
+        how = "written out" if expand else "as it comes"
+        print(f"  ipopt, {how}: median {1e3 * slow:.1f} ms, as long as {slow / each:.0f} sweeps a plan, or as")
+        print(f"    {slow / whole:.1f} plans to the end; costs apart {apart:.1e}")
 
 
 if __name__ == "__main__":

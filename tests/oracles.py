@@ -14,7 +14,13 @@ from dadiff.trajectory import TrajectoryLayout
 
 
 def ipopt(
-    robot: PlanarQuadrotor, layout: TrajectoryLayout, W: np.ndarray, reference: np.ndarray, x_init: np.ndarray
+    robot: PlanarQuadrotor,
+    layout: TrajectoryLayout,
+    W: np.ndarray,
+    reference: np.ndarray,
+    x_init: np.ndarray,
+    *,
+    expand: bool = True,
 ) -> tuple[float, float]:
     """See `ipopt_of`, of one quadrotor."""
     import casadi
@@ -25,7 +31,7 @@ def ipopt(
         upward = thrust * casadi.cos(x[2]) - GRAVITY - robot.drag * x[4]
         return casadi.vertcat(x[3], x[4], x[5], forward, upward, robot.torque_gain * u[1])
 
-    return ipopt_of(robot, rate, layout, W, reference, x_init)
+    return ipopt_of(robot, rate, layout, W, reference, x_init, expand=expand)
 
 
 def cart_pole_rate(x: Any, u: Any) -> Any:
@@ -44,11 +50,14 @@ def ipopt_of(
     W: np.ndarray,
     reference: np.ndarray,
     x_init: np.ndarray,
+    *,
+    expand: bool = True,
 ) -> tuple[float, float]:
     """The least (tau - reference)' W (tau - reference) over trajectories within a robot's bounds from x_init.
 
     Args:
         rate: dx/dt in casadi, integrated by RK4.
+        expand: whether casadi's graph is written out in scalars first; unless told so casadi does not.
 
     Returns:
         The cost, and the processor seconds of solving, without those of writing the problem out.
@@ -72,7 +81,7 @@ def ipopt_of(
     problem.set_initial(u, inputs.T)
     delta = casadi.vertcat(casadi.vec(x), casadi.vec(u)) - reference
     problem.minimize(delta.T @ casadi.sparsify(casadi.DM(W)) @ delta)
-    options = {"print_time": False, "expand": True}
+    options = {"print_time": False, "expand": expand}
     problem.solver("ipopt", options, {"print_level": 0, "sb": "yes", "tol": 1e-10})
     problem.solve()  # sets up what is kept
     begin = time.process_time()

@@ -17,6 +17,7 @@ from dadiff.behaviours import (
     Identified,
     IdentifiedFamily,
     IdentifiedSoft,
+    IdentifiedSparse,
     Inpainting,
     Known,
     KnownClear,
@@ -44,10 +45,10 @@ from dadiff.trajectory.covariance import Covariance
 from dadiff.trajectory.hankel import identity_length, minimum_length, windows
 
 HORIZON, PLANS = 6, 5
-PROJECTORS = {  # what is believed of a family is no projection of one robot's; see test_family.py
+PROJECTORS = {  # of one robot's linear dynamics; see test_family.py, test_manoeuvre.py and test_features.py for others
     name: projector
     for name, projector in variants("projector", {"initial_state": ("free", "fixed")}).items()
-    if not isinstance(projector, NoProjector | Inpainting | IdentifiedFamily | Nominal)
+    if not isinstance(projector, NoProjector | Inpainting | IdentifiedFamily | IdentifiedSparse | Nominal)
 }
 ORTHOGONAL = {name: p for name, p in PROJECTORS.items() if not isinstance(p, RolloutProjector | KnownClear)}
 HOLDING = {name: p for name, p in PROJECTORS.items() if p.initial_state == "fixed"}

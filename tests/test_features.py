@@ -12,6 +12,7 @@ from dadiff.behaviours import (
     HankelLowRank,
     Identified,
     IdentifiedSoft,
+    IdentifiedSparse,
     Known,
     Koopman,
     Lifted,
@@ -32,6 +33,7 @@ TERMS = [
     ("constant", "identity", "trigonometric", "products", "control_affine"),
     ("trigonometric", "control_affine"),
     ("identity", "control_affine"),
+    ("identity", "trigonometric", "turning", "control_affine"),
 ]
 
 
@@ -84,6 +86,35 @@ def test_a_quadrotor_is_predicted_far_better_with_features_than_linearly(rng):
     assert np.isfinite(project(tau)).all()
 
 
+TURNING = ("constant", "identity", "trigonometric", "turning", "control_affine")
+
+
+def test_few_features_are_kept_and_they_predict_far_better(rng):
+    """Noise puts a little of every feature into an estimate; what is left out after is exactly 0."""
+    phi = Features(6, 2, TURNING, (2,))
+    robots = PlanarQuadrotors().inside(3, rng)
+    recording = GaussianExcitation(300, input_std=2.0, process_noise=0.01).record(robots)
+    layout = robots.layout(40)
+    inputs = rng.standard_normal((3, 8, 40, 2))
+    tau = layout.flatten(robots.simulate(np.zeros((3, 8, 6)), inputs), inputs)
+    sparse = IdentifiedSparse("fixed", features=TURNING, angles=(2,)).fit(layout, robots, recording)
+    dense = Identified("fixed", features=TURNING, angles=(2,)).fit(layout, robots, recording)
+    errors = [prediction_error(found, robots, tau)["prediction_error"] for found in (sparse, dense)]
+    assert errors[0] < 0.3 * errors[1]
+    assert 12 <= sparse.notes["terms"] <= 25 < 6 * phi.count
+
+
+def test_dynamics_of_few_features_are_found_with_their_zeros(rng):
+    phi = Features(3, 2, ("constant", "identity"))
+    theta = np.zeros((2, 3, phi.count))
+    theta[:, 0, 1], theta[:, 1, 4], theta[:, 2, 2] = 0.1, 0.5, -0.2
+    truth = Regressed(phi, theta)
+    recording = GaussianExcitation(200, process_noise=0.01).record(truth)
+    found = IdentifiedSparse(features=phi.terms).fit(truth.layout(5), truth, recording)
+    np.testing.assert_array_equal(found.system.theta != 0, theta != 0)
+    np.testing.assert_allclose(found.system.theta, theta, atol=0.1)
+
+
 def test_the_truth_predicts_itself(rng):
     system = double_integrator()
     layout = system.layout(5)
@@ -108,6 +139,8 @@ def test_what_makes_no_sense_is_refused(rng):
     for make, message in [
         (lambda: Features(3, 2, ("trigonometric",)), "trigonometric terms need"),
         (lambda: Features(3, 2, ("identity",), (1,)), "and only they do"),
+        (lambda: Features(3, 2, ("turning",)), "name trigonometric and the angles, too"),
+        (lambda: IdentifiedSparse(), "need some features, no ridge"),
         (lambda: Features(3, 2, ("trigonometric",), (3,)), "the states are 0 to 2"),
         (lambda: Identified(ridge=1.0), "angles and ridge are of features"),
         (lambda: Identified(ridge=-1.0), "ridge is -1"),

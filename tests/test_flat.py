@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 from laws import composed
@@ -9,8 +11,8 @@ from laws import composed
 from dadiff.errors import ConfigError
 from dadiff.running.assembly import Experiment
 from dadiff.running.experiment import execute
-from dadiff.systems import Simulated
-from dadiff.systems.flat import Unicycle, UnicycleTransformation, unicycles
+from dadiff.systems import Continuous, Simulated, double_integrator
+from dadiff.systems.flat import Flat, Unicycle, UnicycleTransformation, unicycles
 from dadiff.tasks.obstacles import Obstacles
 
 MAP = UnicycleTransformation()
@@ -82,6 +84,55 @@ def test_obstacles_are_avoided_after_replay_as_in_flat_coordinates(rng):
     inputs = layout.inputs(planned)
     replayed = layout.flatten(system.replay(cases.x_init[:, None], inputs), inputs)
     scores = task.score(system, cases, planned, replayed).per_plan
+    assert scores["collision_rollout"].mean() <= scores["collision_planned"].mean() + 0.01
+
+
+@dataclass(frozen=True, kw_only=True)
+class Boat(Continuous):
+    """A point in the plane that water holds back: p' = v, v' = u - |v| v."""
+
+    time_step: float | None = 0.1
+    state_dim, input_dim = 4, 2
+
+    def derivative(self, x, u):
+        v = x[..., 2:]
+        return np.concatenate([v, u - np.linalg.norm(v, axis=-1, keepdims=True) * v], axis=-1)
+
+    def derivative_jacobian(self, x, u):
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class BoatTransformation:
+    """z = x and w = v': thrust makes up for the water. Nowhere singular."""
+
+    def forward(self, x):
+        return x
+
+    def start(self, z):
+        return z
+
+    def inverse(self, x, w):
+        v = x[..., 2:]
+        return w + np.linalg.norm(v, axis=-1, keepdims=True) * v
+
+    def singular(self, z):
+        return np.zeros(z.shape[:-1], dtype=bool)
+
+
+def test_another_flat_robot_is_one_class_beside_its_dynamics(rng):
+    flat, task = double_integrator(time_step=0.1, process_noise=0.0), Obstacles()
+    boat = Flat(flat.A, flat.B, time_step=0.1, robot=Boat(), transformation=BoatTransformation())
+    cases = task.cases(boat, 20, rng)
+    layout, planned = boat.layout(task.horizon), cases.reference[:, None]
+    states, inputs = layout.split(planned)
+    replayed = boat.replay(cases.x_init[:, None], inputs)
+    apart = np.linalg.norm((states - replayed)[..., :2], axis=-1).max()
+    assert apart < 0.1**2 * np.linalg.norm(inputs, axis=-1).max()
+    drifting = Boat().simulate(cases.x_init[:, None], inputs)
+    assert np.linalg.norm((states - drifting)[..., :2], axis=-1).max() > 10 * apart
+    np.testing.assert_array_equal(boat.singular(replayed), 0)
+    scores = task.score(boat, cases, planned, layout.flatten(replayed, inputs)).per_plan
     assert scores["collision_rollout"].mean() <= scores["collision_planned"].mean() + 0.01
 
 

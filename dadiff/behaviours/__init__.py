@@ -2,7 +2,7 @@
 
 from dadiff.behaviours.doubt import Doubted
 from dadiff.behaviours.family import IdentifiedFamily
-from dadiff.behaviours.identified import Identified, IdentifiedSoft, Koopman
+from dadiff.behaviours.identified import Identified, IdentifiedSoft, IdentifiedSparse, Koopman
 from dadiff.behaviours.known import (
     Inpainting,
     Known,
@@ -37,6 +37,7 @@ __all__ = [
     "Identified",
     "IdentifiedFamily",
     "IdentifiedSoft",
+    "IdentifiedSparse",
     "Inpainting",
     "Known",
     "KnownClear",

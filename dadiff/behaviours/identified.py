@@ -10,7 +10,7 @@ import numpy as np
 
 from dadiff.behaviours.doubt import Doubted
 from dadiff.behaviours.known import BoundsChoice, within
-from dadiff.behaviours.least_squares import Offset, Transitions, least_squares, lifted, regressed
+from dadiff.behaviours.least_squares import Offset, Transitions, least_squares, lifted, regressed, significant
 from dadiff.behaviours.lifted import Lifted
 from dadiff.behaviours.limited import Limited
 from dadiff.behaviours.manifold import Manifold
@@ -78,6 +78,34 @@ class Identified(Fitted[Dynamics | Manifold | Limited]):
             return within(Manifold(layout, regressed(data, phi, self.ridge).system, notes=notes), self.bounds, sources)
         estimate = least_squares(data, self.offset, sources.offset(self.offset))
         return within(Dynamics(layout, estimate.stages(layout.horizon), notes=notes), self.bounds, sources)
+
+
+@dataclass(frozen=True)
+class IdentifiedSparse(Identified):
+    """Nonlinear dynamics of few features: those whose estimates are many standard errors from 0, see `significant`.
+
+    Args:
+        significance: how many.
+    """
+
+    label: ClassVar[str] = "identified_sparse"
+    significance: float = 4.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.features or self.ridge or not 0 <= self.significance < np.inf:
+            raise ConfigError(
+                f"projector: features are {list(self.features)}, ridge {self.ridge}, significance {self.significance}; "
+                "need some features, no ridge, and a number that is not negative"
+            )
+
+    def find(self, layout: TrajectoryLayout, sources: Sources) -> Dynamics | Manifold | Limited:
+        """The trajectories of the estimated dynamics; see `Identified.find`."""
+        data = transitions(layout, sources, self.learn_from)
+        phi = Features(layout.state_dim, layout.input_dim, with_offset(self.features, self.offset), self.angles)
+        found = significant(data, phi, self.significance).system
+        terms = float((found.theta != 0).sum(axis=(-2, -1)).mean())
+        return within(Manifold(layout, found, notes={"rank": layout.rank, "terms": terms}), self.bounds, sources)
 
 
 @dataclass(frozen=True)

@@ -185,6 +185,46 @@ def regressed(data: Transitions, features: Features, ridge: float = 0.0) -> Regr
     return Regression(Regressed(features, theta), spread, noise)
 
 
+def significant(data: Transitions, features: Features, threshold: float) -> Regression:
+    """As `regressed`, but of the terms that matter, state by state; see `selected`.
+
+    Dynamics have few terms; noise puts a little of every other into an estimate, and along a chain of integrators that
+    little grows.
+    """
+    Phi, target = features(data.x, data.u), data.following - data.x
+    _check_features(Phi, 0.0)
+    lead, p, n = Phi.shape[:-2], Phi.shape[-1], target.shape[-1]
+    rows, wanted = Phi.reshape(-1, *Phi.shape[-2:]), target.reshape(-1, *target.shape[-2:])
+    theta, noise = np.zeros((len(rows), n, p)), np.zeros((len(rows), n))
+    for robot, state in np.ndindex(len(rows), n):
+        right = wanted[robot, :, state]
+        kept = selected(rows[robot], right, threshold, features.degrees)
+        if kept:
+            estimate, _, (noise[robot, state],) = regression(rows[robot][:, kept], right[:, None])
+            theta[robot, state, kept] = estimate[0]
+    system = Regressed(features, theta.reshape(*lead, n, p))
+    return Regression(system, regression(Phi, target)[1], noise.reshape(*lead, n))
+
+
+def selected(Phi: np.ndarray, target: np.ndarray, threshold: float, degree: np.ndarray) -> list[int]:
+    """The columns of Phi (count, p) that a target (count,) is explained by: backward elimination.
+
+    Of the columns whose estimates are fewer than `threshold` standard errors from 0, the least sure of the highest
+    degree (p,) is left out and the rest estimated anew, until none is: products go before what they are products of.
+    """
+    kept = list(range(Phi.shape[-1]))
+    while kept:
+        estimate, spread, (noise,) = regression(Phi[:, kept], target[:, None])
+        error = np.sqrt(noise * np.diag(spread)) + ROUNDING * np.abs(estimate).max()
+        sureness, order = np.abs(estimate[0]) / np.maximum(error, np.finfo(float).tiny), degree[kept]
+        unsure = sureness < threshold
+        if not unsure.any():
+            break
+        of_highest = unsure & (order == order[unsure].max())
+        del kept[int(np.where(of_highest, sureness, np.inf).argmin())]
+    return kept
+
+
 def lifted(data: Transitions, observables: Features, ridge: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     """K (*robots, p, p) and B (*robots, p, m) of psi(x(t+1)) = K psi(x(t)) + B u(t), from transitions.
 

@@ -5,6 +5,7 @@ phi is put together from terms, in this order; s(x) stands for the state feature
     identity        x and u
     trigonometric   sin and cos of chosen entries of x
     products        s_i s_j of the above, without the squares of cosines
+    turning         each state that is no angle, times sin and cos: what rates do to an angle within a step
     control_affine  u_k times sin and cos where there are any, and times x otherwise
     constant        1
 """
@@ -21,7 +22,7 @@ from dadiff.errors import ConfigError, ShapeError
 from dadiff.systems.nonlinear import affine
 from dadiff.systems.system import System, Times
 
-Term = Literal["constant", "identity", "trigonometric", "products", "control_affine"]
+Term = Literal["constant", "identity", "trigonometric", "products", "turning", "control_affine"]
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,8 @@ class Features:
                 f"features: terms are {', '.join(self.terms)} and angles {list(self.angles)}; trigonometric terms need "
                 "the indices of the states that are angles, and only they do"
             )
+        if "turning" in self.terms and "trigonometric" not in self.terms:
+            raise ConfigError("features: turning multiplies sines and cosines; name trigonometric and the angles, too")
         if any(not 0 <= k < self.states for k in self.angles):
             raise ConfigError(f"features: angles are {list(self.angles)}; the states are 0 to {self.states - 1}")
 
@@ -56,18 +59,30 @@ class Features:
         """p."""
         return self(np.zeros(self.states), np.zeros(self.inputs)).shape[-1]
 
+    @property
+    def degrees(self) -> np.ndarray:
+        """Of each feature, (p,): 0 of the constant, 1 of states, inputs, sines and cosines, 2 of products."""
+        parts = self._parts(np.zeros(self.states), np.zeros(self.inputs))
+        return np.concatenate([np.full(part.shape[-1], degree) for degree, part in parts])
+
     def __call__(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
         """phi, (..., p)."""
+        return np.concatenate([part for _, part in self._parts(x, u)], axis=-1)
+
+    def _parts(self, x: np.ndarray, u: np.ndarray) -> list[tuple[int, np.ndarray]]:
+        """Terms of one degree each."""
         s = self._of_states(x)
-        parts = [s, u] if "identity" in self.terms else [s]
+        parts = [(1, s), (1, u)] if "identity" in self.terms else [(1, s)]
         if "products" in self.terms:
             i, j = self._pairs(s.shape[-1])
-            parts.append(s[..., i] * s[..., j])
+            parts.append((2, s[..., i] * s[..., j]))
+        if "turning" in self.terms:
+            parts.append((2, _outer(x[..., self._others], self._steering(s))))
         if "control_affine" in self.terms:
-            parts.append(_outer(u, self._steering(s)))
+            parts.append((2, _outer(u, self._steering(s))))
         if "constant" in self.terms:
-            parts.append(np.ones((*x.shape[:-1], 1)))
-        return np.concatenate(parts, axis=-1)
+            parts.append((0, np.ones((*x.shape[:-1], 1))))
+        return parts
 
     def jacobian(self, x: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """dphi/dx (..., p, n) and dphi/du (..., p, m)."""
@@ -84,14 +99,24 @@ class Features:
             i, j = self._pairs(s.shape[-1])
             by_x = s[..., i, None] * ds[..., j, :] + s[..., j, None] * ds[..., i, :]
             blocks.append((by_x, none(len(i), m)))
+        steering, slope = self._steering(s), self._steering(ds.swapaxes(-1, -2)).swapaxes(-1, -2)
+        if "turning" in self.terms:
+            still, rows = x[..., self._others], np.eye(n)[self._others]
+            by_x = still[..., :, None, None] * slope[..., None, :, :] + rows[:, None, :] * steering[..., None, :, None]
+            by_x = by_x.reshape(*lead, -1, n)
+            blocks.append((by_x, none(by_x.shape[-2], m)))
         if "control_affine" in self.terms:
-            steering, slope = self._steering(s), self._steering(ds.swapaxes(-1, -2)).swapaxes(-1, -2)
             by_x = (u[..., :, None, None] * slope[..., None, :, :]).reshape(*lead, -1, n)
             blocks.append((by_x, (np.eye(m)[:, None, :] * steering[..., None, :, None]).reshape(*lead, -1, m)))
         if "constant" in self.terms:
             blocks.append((none(1, n), none(1, m)))
         dx, du = zip(*blocks, strict=True)
         return np.concatenate(dx, axis=-2), np.concatenate(du, axis=-2)
+
+    @property
+    def _others(self) -> list[int]:
+        """The states that are no angles."""
+        return [k for k in range(self.states) if k not in self.angles]
 
     def _of_states(self, x: np.ndarray) -> np.ndarray:
         angles = x[..., list(self.angles)]
