@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from dadiff.reporting.claims import Claim, Finding, conclude, decide
-from dadiff.reporting.labels import axis_value, metric_name, number, with_interval
+from dadiff.reporting.labels import axis_value, column_name, metric_name, number, with_interval
 from dadiff.reporting.measures import IDENTITY
 from dadiff.reporting.statistics import Estimate
 
@@ -161,7 +161,7 @@ def _compared(content: Mapping[str, Any]) -> list[str]:
     compared = [(label, ratio) for label, ratio in rows if ratio and label.split(",")[0] != baseline]
     if not compared:
         return []
-    name = metric_name(metric).split(" ‖")[0]
+    name = column_name(metric).split(" ‖")[0]
     better = sorted((found for found in compared if found[1].high < 1), key=lambda found: found[1].value)
     worse = sorted((found for found in compared if found[1].low > 1), key=lambda found: -found[1].value)
     return [_better(name, baseline, better, len(compared)), _worse(name, worse, table["rows"])]

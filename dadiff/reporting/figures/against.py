@@ -15,8 +15,10 @@ from matplotlib.figure import Figure
 
 from dadiff.reporting.aggregation import Evidence, Method, has_metric, pair, varying
 from dadiff.reporting.figures.style import (
+    Look,
     at_the_edge,
     drawn,
+    label_ends,
     legend_below,
     letter,
     log_axis,
@@ -68,7 +70,7 @@ class Against:
         """One panel a metric and condition, both axes logarithmic."""
         figure, axes = panels(len(self.panels), columns)
         for ax, panel in zip(axes, self.panels, strict=True):
-            _draw_panel(ax, panel)
+            _draw_panel(ax, panel, labelled=columns > 1)
             self._mark(ax)
             ax.set_xlabel(axis_name(self.axis))
             ax.set_ylabel(f"relative to {self.relative}" if self.relative else "")
@@ -84,7 +86,7 @@ class Against:
             ax.axhline(1, color="#888888", lw=0.8, zorder=0)
 
 
-def _draw_panel(ax: Axes, panel: Panel) -> None:
+def _draw_panel(ax: Axes, panel: Panel, *, labelled: bool) -> None:
     for line, look in zip(panel.lines, looks_of([line.axes for line in panel.lines]), strict=True):
         exact = np.array([e.value for e in line.y])
         y = drawn(exact)
@@ -103,7 +105,16 @@ def _draw_panel(ax: Axes, panel: Panel) -> None:
     values = [e.value for line in (*panel.lines, *panel.levels) for e in line.y if not math.isnan(e.value)]
     if values and min(values) >= 0:
         log_axis(ax, "y")
+        if labelled:
+            label_ends(ax, [(line.label, end, look.colour) for line, look, end in _ends(panel)])
     log_axis(ax, "x")
+
+
+def _ends(panel: Panel) -> list[tuple[Line, Look, float]]:
+    """The lines with their looks and the values where they end; those at rounding have no place on the axis."""
+    looks = looks_of([line.axes for line in panel.lines])
+    ends = [(line, look, line.y[-1].value) for line, look in zip(panel.lines, looks, strict=True) if line.y]
+    return [end for end in ends if end[2] > ROUNDING]
 
 
 def collect(

@@ -14,8 +14,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from dadiff.reporting.aggregation import EPISODES, Evidence, Method, varying
-from dadiff.reporting.figures.style import legend_below, letter, log_axis, looks_of, panels
-from dadiff.reporting.labels import method_name
+from dadiff.reporting.figures.style import label_ends, legend_below, letter, log_axis, looks_of, panels
+from dadiff.reporting.labels import ROUNDING, method_name
 from dadiff.reporting.selection import Selector
 from dadiff.reporting.statistics import Estimate, mean
 
@@ -51,14 +51,14 @@ class Intervals:
         """One panel a controller."""
         figure, axes = panels(len(self.lines), columns)
         for ax, (controller, lines) in zip(axes, self.lines.items(), strict=True):
-            _draw(ax, lines, self.expert, self.against)
+            _draw(ax, lines, self.expert, self.against, labelled=columns > 1)
             ax.set_title(TITLES.get(controller, controller), wrap=True)
         letter(axes)
         legend_below(figure, axes)
         return figure
 
 
-def _draw(ax: Axes, lines: list[Line], expert: Line | None, against: Against) -> None:
+def _draw(ax: Axes, lines: list[Line], expert: Line | None, against: Against, *, labelled: bool) -> None:
     for line, look in zip(lines, looks_of([line.axes for line in lines]), strict=True):
         y = [estimate.value for estimate in line.cost]
         bars = [[e.value - e.low for e in line.cost], [e.high - e.value for e in line.cost]]
@@ -72,6 +72,10 @@ def _draw(ax: Axes, lines: list[Line], expert: Line | None, against: Against) ->
     ax.set_ylabel(f"cost over that of the expert\nplanning at the {against} interval")
     log_axis(ax, "x")
     log_axis(ax, "y")
+    if labelled:
+        looks = looks_of([line.axes for line in lines])
+        ends = [(line.label, line.cost[-1].value, look.colour) for line, look in zip(lines, looks, strict=True)]
+        label_ends(ax, [end for end in ends if end[1] > ROUNDING])
 
 
 def collect(

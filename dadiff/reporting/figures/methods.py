@@ -13,8 +13,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from dadiff.reporting.aggregation import Evidence, Method, has_metric, varying
-from dadiff.reporting.figures.style import INK, drawn, letter, log_axis, look_of, panels
-from dadiff.reporting.labels import FLOORS, ROUNDING, method_name, metric_name
+from dadiff.reporting.figures.style import INK, drawn, headline, letter, log_axis, look_of, panels
+from dadiff.reporting.labels import FLOORS, PROJECTORS, ROUNDING, column_name, method_name, metric_name, number
 from dadiff.reporting.selection import Selector
 from dadiff.reporting.statistics import Estimate, mean
 
@@ -35,12 +35,17 @@ class Row:
 
 @dataclass(frozen=True)
 class Methods:
-    """What the figure shows: for each metric its rows, the first one on top."""
+    """What the figure shows: for each metric its rows, the first one on top.
+
+    Args:
+        above: whether metrics are shown above what they cannot go below, such as a cost above the optimal one.
+    """
 
     metrics: list[str]
     rows: list[list[Row]]
     dot: str
     log: bool
+    above: bool
     best: dict[str, float]
     runs: list[str]
     notes: list[str]
@@ -50,12 +55,29 @@ class Methods:
         figure, axes = panels(len(self.metrics), columns, width=4.1, height=0.9 + 0.32 * len(self.rows[0]))
         for index, (ax, metric, rows) in enumerate(zip(axes, self.metrics, self.rows, strict=True)):
             _draw_rows(ax, rows, log=self.log)
-            ax.set_title(metric_name(metric))
+            ax.set_title(column_name(metric) if self.above else metric_name(metric))
             ax.tick_params(labelleft=index % columns == 0)
-            if metric in self.best:
+            if self.above:
+                _say_values(ax, rows)
+                ax.set_xlabel("lower is better")
+            elif metric in self.best:
                 ax.axvline(self.best[metric], color="#888888", lw=0.8, ls=":", zorder=0)
         letter(axes)
+        headline(figure, self.found)
         return figure
+
+    @property
+    def found(self) -> str:
+        """Of a metric above its floor: which method has the lowest mean, and what vanilla diffusion has."""
+        means = (
+            {row.label: row.estimate.value for row in self.rows[0] if row.estimate} if self.above and self.rows else {}
+        )
+        vanilla = means.get(PROJECTORS["none"])
+        if vanilla is None or len(means) < 2:
+            return ""
+        best = min(means, key=means.__getitem__)
+        name, beside = column_name(self.metrics[0]), number(vanilla, 2)
+        return f"Lowest {name}: {number(means[best], 2)} with {best}; vanilla: {beside}"
 
 
 def _draw_rows(ax: Axes, rows: list[Row], *, log: bool) -> None:
@@ -88,6 +110,18 @@ def _draw_rows(ax: Axes, rows: list[Row], *, log: bool) -> None:
         log_axis(ax, "x")
 
 
+def _say_values(ax: Axes, rows: list[Row]) -> None:
+    """Means as numbers at the right edge."""
+    for y, row in enumerate(rows):
+        if row.estimate:
+            place: dict[str, Any] = {
+                "xycoords": ("axes fraction", "data"),
+                "textcoords": "offset points",
+                "va": "center",
+            }
+            ax.annotate(number(row.estimate.value, 2), (1, y), (4, 0), fontsize=8, annotation_clip=False, **place)
+
+
 def shortened(text: str, most: int = 30) -> str:
     """A text that fits into a panel; the whole of it stands in the notes."""
     return text if len(text) <= most else text[: most - 1] + "…"
@@ -101,27 +135,34 @@ def collect(
     log: bool = True,
     best: dict[str, float] | None = None,
     group: str | None = None,
+    above: bool = False,
 ) -> Methods:
     """The methods that `cells` asks for, diverged ones named in their place; metrics that none has are left out.
 
     Args:
         group: of a fleet, the robots of this group alone.
         best: metric -> where a dotted line marks what cannot be bettered.
+        above: show metrics above what they cannot go below.
     """
     methods = evidence.methods(cells)
     shown, alive = varying(methods), [method for method in methods if method.finished]
     kept = [name for name in metrics if any(has_metric(method.finished, name) for method in alive)]
-    rows = [[_row(method, metric, shown, group) for method in methods] for metric in kept]
+    rows = [
+        [_row(method, metric, shown, group, FLOORS.get(metric, 0) if above else 0) for method in methods]
+        for metric in kept
+    ]
     robots = any("robots" in method.counts() for method in alive)
     notes = [f"{method_name(m.axes, shown)}: {m.outcome}" for m in methods if m.lost]
-    return Methods(kept, rows, "robot" if robots else "case", log, best or {},
+    return Methods(kept, rows, "robot" if robots else "case", log, above, best or {},
                    [key for m in alive for key in m.keys], notes)  # fmt: skip
 
 
-def _row(method: Method, metric: str, shown: list[str], group: str | None) -> Row:
+def _row(method: Method, metric: str, shown: list[str], group: str | None, floor: float) -> Row:
     label = method_name(method.axes, shown)
     if not method.finished:
         return Row(label, method.axes, None, np.empty(0), method.outcome)
     draws = method.runs.scalars(metric, group)
     dots = np.nanmean(draws.values, axis=-1) if "robot" in draws.levels else draws.values
-    return Row(label, method.axes, mean(draws, FLOORS.get(metric, 0)), dots.ravel(), "")
+    found = mean(draws, FLOORS.get(metric, 0))
+    shown_above = Estimate(found.value - floor, found.low - floor, found.high - floor)
+    return Row(label, method.axes, shown_above, dots.ravel() - floor, "")
