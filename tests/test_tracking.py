@@ -76,6 +76,24 @@ def test_a_run_is_mirrored_with_curves_scalars_and_tables(tracking, tmp_path):
     assert files == {"run.json", "config.yaml", "per_step.parquet"}
 
 
+@pytest.mark.parametrize("name", ["a%20b", "50 % off?#1", "q'uote\"d"])
+def test_a_folder_of_any_name_is_tracked_and_nothing_is_written_beside_it(name, tmp_path):
+    home = tmp_path / "stores"
+    for place in (home / name, home / f"moved {name}"):
+        if place.name.startswith("moved"):
+            (home / name).rename(place)
+        else:
+            store(place)
+        assert sync(place) == 1
+        tracking = Tracking.of({}, place)
+        (mirror,) = runs(tracking)
+        client = open_client(tracking.uri)
+        assert "run.json" in {artifact.path for artifact in client.list_artifacts(mirror.info.run_id)}
+        assert (place / "mlartifacts" / mirror.info.run_id / "artifacts" / "run.json").is_file()
+        assert [path.name for path in home.iterdir()] == [place.name]
+        assert str(place) in tracking.how_to_look("x") or "cd " in tracking.how_to_look("x")
+
+
 def test_nothing_is_logged_twice(tracking, tmp_path):
     run = store(tmp_path)
     for _ in range(3):

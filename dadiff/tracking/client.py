@@ -17,7 +17,8 @@ from typing import TYPE_CHECKING
 from dadiff.errors import MissingExtraError, StoreError
 from dadiff.outside import without_passwords
 from dadiff.store.files import locked
-from dadiff.tracking.database import SQLITE, prepare_database
+from dadiff.tracking.database import prepare_database
+from dadiff.tracking.places import SQLITE, address_of, artifacts_of
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -40,7 +41,7 @@ def open_client(uri: str) -> MlflowClient:
     _set_up()
     from mlflow import MlflowClient
 
-    return MlflowClient(tracking_uri=uri)
+    return MlflowClient(tracking_uri=address_of(uri))
 
 
 def _set_up() -> None:
@@ -68,7 +69,8 @@ def prepare_store(uri: str, experiment: str, artifacts: str | None) -> str:
 def _experiment_id(client: MlflowClient, name: str, artifacts: str | None) -> str:
     found = client.get_experiment_by_name(name)
     if found is None:
-        return client.create_experiment(name, artifact_location=artifacts, tags=EXPERIMENT_TAGS)
+        place = None if artifacts is None else artifacts_of(artifacts)
+        return client.create_experiment(name, artifact_location=place, tags=EXPERIMENT_TAGS)
     if found.lifecycle_stage != "active":
         client.restore_experiment(found.experiment_id)
     return found.experiment_id

@@ -14,8 +14,8 @@ from pathlib import Path
 
 from dadiff.errors import StoreError
 from dadiff.store.files import make_folder
+from dadiff.tracking.places import SQLITE, address_of, artifacts_of, folder_of
 
-SQLITE = "sqlite:///"
 HEADER = b"SQLite format 3\0"
 COMPANIONS = ("", "-wal", "-shm", "-journal")
 
@@ -71,7 +71,7 @@ def _moved(connection: sqlite3.Connection, path: Path, experiment: str, artifact
     question = "SELECT artifact_location FROM experiments WHERE name = ?"
     found = connection.execute(question, (experiment,)).fetchone()
     beside = artifacts is not None and Path(artifacts).is_relative_to(path.parent)
-    if found is None or not beside or Path(found[0].removeprefix("file://")).is_relative_to(path.parent):
+    if found is None or not beside or folder_of(found[0]).is_relative_to(path.parent):
         return None
     return f"names files at {found[0]}, where its folder lay before"
 
@@ -92,11 +92,12 @@ def _create(path: Path) -> None:
     for left in path.parent.glob(f".{path.name}.making*"):
         left.unlink()
     making = path.with_name(f".{path.name}.making")
-    SqlAlchemyStore(SQLITE + str(making), str(path.parent / "mlartifacts")).engine.dispose()
+    SqlAlchemyStore(address_of(SQLITE + str(making)), artifacts_of(path.parent / "mlartifacts")).engine.dispose()
     shared = path.parent.stat().st_mode & 0o060  # SQLite gives no rights to a group, whatever the umask
     making.chmod(making.stat().st_mode | shared)
     making.rename(path)
-    SqlAlchemyStore._get_or_create_engine(SQLITE + str(path)).dispose()  # connections of this process to what lay here
+    here = address_of(SQLITE + str(path))
+    SqlAlchemyStore._get_or_create_engine(here).dispose()  # connections of this process to what lay here
 
 
 def _write_ahead(path: Path) -> None:

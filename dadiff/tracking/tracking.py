@@ -13,10 +13,11 @@ from dadiff.outside import without_passwords
 from dadiff.store import StoredRun, Sweep, Sweeps, store_id
 from dadiff.tracking.client import open_client, prepare_store, spared
 from dadiff.tracking.content import Piece, run_piece, sweep_piece, training_piece
-from dadiff.tracking.database import SQLITE, damage_of
+from dadiff.tracking.database import damage_of
 from dadiff.tracking.links import LOCAL_UI, Held, held
 from dadiff.tracking.mirror import opened
 from dadiff.tracking.models import log_models
+from dadiff.tracking.places import SQLITE, interface_of
 from dadiff.tracking.views import STATE, short_names, sweep_view, table_page
 
 if TYPE_CHECKING:
@@ -161,7 +162,7 @@ class Tracking:
         page = table_page(experiment_id, sweep_name)
         if self.uri.startswith("http"):
             return f"open {without_passwords(self.uri)}{page}"
-        return f"mlflow ui --backend-store-uri {self.uri}   then open {LOCAL_UI}{page}"
+        return f"{interface_of(self.uri)}   then open {LOCAL_UI}{page}"
 
     @cached_property
     def _experiment_id(self) -> str:

@@ -14,7 +14,7 @@ from dadiff.store import Cache, Record, Results
 from dadiff.sync import sync
 from dadiff.tracking import Tracking
 from dadiff.tracking.client import open_client
-from tests.faults.kills import PLACES, launch, reference, trial
+from tests.faults.kills import PLACES, launch, reference, struck_at_random, trial
 from tests.faults.stores import Server, postgresql, postgresql_binaries
 
 pytestmark = pytest.mark.slow
@@ -28,6 +28,10 @@ def undisturbed(tmp_path_factory):
 @pytest.mark.parametrize("place", PLACES)
 def test_a_sweep_survives_a_kill(place, undisturbed, tmp_path):
     assert trial(tmp_path / "outputs", PLACES[place], undisturbed).problems == []
+
+
+def test_first_starts_that_are_killed_at_random_moments_recover(tmp_path):
+    assert [done.problems for done in struck_at_random(tmp_path, 6, seed=1)] == [[]] * 6
 
 
 def open_at_once(root: Path, number: int, ready) -> None:
