@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import re
+import shlex
+from pathlib import Path
+
 import numpy as np
 import pytest
 from test_physics import SYSTEM, run
@@ -121,3 +125,24 @@ def test_a_value_that_never_varied_is_far_as_soon_as_it_differs(caplog):
     condition = Layout((Channel("x_init", 1), Channel("obstacles", 1)))
     assert outside(condition, np.array([[0.0, 0.3], [1.0, 0.3]]), np.array([[0.5, 0.3], [0.5, 0.31]])) == 1
     assert "of obstacles, case 1 has 0.31 where training had 0.3 to 0.3" in caplog.text
+
+
+OWN_DATA = (Path(__file__).parent.parent / "docs" / "your-own-data.md").read_text()
+
+
+def test_a_newcomer_gets_through_the_page_on_own_data(tmp_path, monkeypatch, capsys):
+    """Its scripts and commands one after the other, as written; trainings are kept short."""
+    monkeypatch.chdir(tmp_path)
+    small = ["denoiser=moment_matched", "evaluation.samples=1", "tracking.enabled=false", "progress=false"]
+    done = []
+    for kind, block in re.findall(r"^```(python|text)\n(.*?)^```", OWN_DATA, flags=re.DOTALL | re.MULTILINE):
+        if kind == "python":
+            exec(compile(block, "page", "exec"), {})
+        else:
+            words = shlex.split(block)[1:]
+            few = [] if "dataset=npz" in words else ["dataset.train_size=60", "dataset.test_size=2"]
+            done.append(dadiff.run([*words, *small, *few]))
+    assert [run.status for run in done] == ["finished"] * 3
+    assert all(run.metrics["recording_residual"] == pytest.approx(1, abs=0.1) for run in done)
+    told = capsys.readouterr().out
+    assert "[1.0, 0.0, 0.1, 0.0]" in told.replace("-0.0", "0.0")

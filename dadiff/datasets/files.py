@@ -9,18 +9,22 @@ import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 
 from dadiff.datasets.excitation import check_excited, tell_held
 from dadiff.datasets.generated import Part
-from dadiff.datasets.logs import ENDINGS, list_logs, read_runs, side_by_side
+from dadiff.datasets.logs import ENDINGS, Run, list_logs, read_runs, runs_of, side_by_side
 from dadiff.datasets.physics import judge, judge_runs, plant_of, tell_offset, tell_shifted
+from dadiff.datasets.tables import Columns, arrays_of_table
 from dadiff.errors import ConfigError, DataError, NotApplicableError
 from dadiff.outside import digest_of, npz
 from dadiff.systems import Recording, System, TimeVarying
 from dadiff.tasks import Cases, Demonstrations, Task
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 INPUT_NAMES = ("inputs", "controls")
 
@@ -212,21 +216,48 @@ class NpzRecordings:
         return _together(folders, [self._read(folder, system, robot) for robot, folder in enumerate(folders)])
 
     def _read(self, folder: Path, system: System, robot: int | None = None) -> Recording:
-        files = {file: read_runs(file, system, self.columns) for file in list_logs(folder)}
-        runs = [run for its in files.values() for run in its]
-        _tell_duplicates([(file, x) for file, its in files.items() for x, _ in its])
-        plant = plant_of(system, runs, robot)
+        runs = {str(file): read_runs(file, system, self.columns) for file in list_logs(folder)}
+        return self.judged(runs, str(folder), system, robot)
+
+    def judged(
+        self, runs: Mapping[str, Sequence[Run]], where: str, system: System, robot: int | None = None
+    ) -> Recording:
+        """Runs side by side, held against the system.
+
+        Args:
+            runs: by the name of what they are from.
+            where: all of them are from.
+        """
+        _tell_duplicates([(name, x) for name, its in runs.items() for x, _ in its])
+        together = [run for its in runs.values() for run in its]
+        plant = plant_of(system, together, robot)
         if plant.learned:
-            tell_shifted(runs, str(folder))
+            tell_shifted(together, where)
         elif self.offset == "estimated":
-            plant = tell_offset(plant, runs, str(folder))
-        ratios = [judge_runs(plant, its, str(file), self.allow_mismatch) for file, its in files.items()]
-        notes: dict[str, float] = {"recording_residual": max(ratios)}
-        states, inputs = side_by_side(runs)
-        notes["inputs_held"] = tell_held([u for _, u in runs], str(folder))
+            plant = tell_offset(plant, together, where)
+        ratios = [judge_runs(plant, its, name, self.allow_mismatch) for name, its in runs.items()]
+        states, inputs = side_by_side(together)
+        notes = {"recording_residual": max(ratios), "inputs_held": float(tell_held([u for _, u in together], where))}
         if not self.allow_mismatch:
-            notes["excitation_condition"] = check_excited(inputs, system.state_dim + 1, str(folder))
+            notes["excitation_condition"] = check_excited(inputs, system.state_dim + 1, where)
         return Recording(states, inputs, notes)
+
+
+def recording_of(tables: Sequence[pd.DataFrame], columns: Columns, system: System, **options: Any) -> Recording:
+    """A recording from data frames, read and judged like files.
+
+    Args:
+        tables: one row a time step.
+        columns: as of `NpzRecordings`.
+        system: that they are held against; `dadiff.systems.unknown(n, m)` where there is none.
+        options: `allow_mismatch` and `offset`, as of `NpzRecordings`.
+
+    Example:
+        >>> recording_of([log], {"states": ["x", "v"], "inputs": ["u"]}, unknown(2, 1)).length
+    """
+    named = {f"table {k}": arrays_of_table(table, columns, f"table {k}") for k, table in enumerate(tables)}
+    runs = {name: [run for part in parts for run in runs_of(part, name, system)] for name, parts in named.items()}
+    return NpzRecordings("tables", columns, **options).judged(runs, "tables", system)
 
 
 def _together(folders: Sequence[Path], recordings: Sequence[Recording]) -> Recording:
@@ -246,10 +277,10 @@ def _together(folders: Sequence[Path], recordings: Sequence[Recording]) -> Recor
     return Recording(np.stack([r.states for r in recordings]), np.stack([r.inputs for r in recordings]), notes)
 
 
-def _tell_duplicates(runs: Sequence[tuple[Path, np.ndarray]]) -> None:
+def _tell_duplicates(runs: Sequence[tuple[str, np.ndarray]]) -> None:
     """Say which runs are copies of others: they add nothing to what is learned from them."""
-    seen: dict[bytes, Path] = {}
-    for file, states in runs:
-        first = seen.setdefault(states.tobytes(), file)
-        if first != file:
-            log.warning("%s: is a copy of %s, and adds nothing", file, first.name)
+    seen: dict[bytes, str] = {}
+    for name, states in runs:
+        first = seen.setdefault(states.tobytes(), name)
+        if first != name:
+            log.warning("%s: is a copy of %s, and adds nothing", name, Path(first).name)
