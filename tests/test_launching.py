@@ -248,7 +248,7 @@ def test_the_time_left_is_that_of_what_runs_and_waits_at_the_pace_of_what_ended(
     assert time_left([], [1.0], 5) is None
     assert time_left([10.0, 30.0], [5.0, 5.0], waiting=4) == (15 + 15 + 4 * 20) / 2
     assert shortened("a" * 30 + "b" * 30, 21) == "a" * 10 + "…" + "b" * 10
-    assert progress_of("loading the data") == "loading the data"
+    assert progress_of("2026-01-31 12:00:00,123 loading the data") == "loading the data"
 
 
 def test_the_last_line_of_a_log_is_its_progress(tmp_path):

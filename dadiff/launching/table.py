@@ -124,6 +124,7 @@ def time_left(ended: Sequence[float], running: Sequence[float], waiting: int) ->
     return (sum(max(0.0, mean - seconds) for seconds in running) + waiting * mean) / len(running)
 
 
+STAMP = re.compile(r"^\d{4}-\d\d-\d\d [\d:,.]+ ")
 BAR = re.compile(r"^(.*?):?\s+(\d+)%\|.*?\|\s*(\S+)\s+\[[\d:?]+<([\d:?]+)")
 
 
@@ -134,6 +135,7 @@ def progress_of(line: str) -> str:
         >>> progress_of("sampling:  42%|####      | 42/100 [00:05<00:07,  8.2it/s]")
         'sampling 42 %, 00:07 left'
     """
+    line = STAMP.sub("", line)
     found = BAR.match(line)
     return f"{found[1]} {found[2]} %, {found[4]} left" if found else line[:MOST_PROGRESS]
 

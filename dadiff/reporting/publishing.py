@@ -4,6 +4,7 @@
 
 Parts of documents stand between marks that name them:
 
+    <!-- figure: fleet/cost -->    a figure of a published report, and what it found
     <!-- sentences: paper_lqr -->  what a published report found, in its three sentences
     <!-- ledger: short -->         one verdict a claim, of the claims that have a short name
     <!-- ledger: all -->           the same of all claims, with exceptions and effects in full
@@ -24,7 +25,7 @@ from dadiff.reporting.definitions import FOLDER
 from dadiff.reporting.labels import with_interval
 from dadiff.reporting.story import Line
 
-BLOCK = re.compile(r"(<!-- (\w+): (\w+) -->\n).*?(?=<!-- end -->)", flags=re.DOTALL)
+BLOCK = re.compile(r"(<!-- (\w+): ([\w/]+) -->\n).*?(?=<!-- end -->)", flags=re.DOTALL)
 
 
 def write_pages(root: Path) -> list[Path]:
@@ -62,6 +63,12 @@ def documents(root: Path) -> list[Path]:
 def _prefix(document: Path, root: Path) -> str:
     up = len(document.absolute().parent.relative_to(root.absolute().parent.parent).parts)
     return "../" * up + "reports/published"
+
+
+def _figure(which: str, root: Path, claims: list[Claim], prefix: str) -> str:
+    name, _, figure = which.partition("/")
+    part = published.read(root / name)["figures"][figure]
+    return f"![{part.get('found') or part['title']}]({prefix}/{name}/figures/{figure}.svg)"
 
 
 def _sentences(name: str, root: Path, claims: list[Claim], prefix: str) -> str:
@@ -105,7 +112,11 @@ def _plain(unit: str) -> str:
     return re.sub(r" ‖.*?‖²", "", unit)
 
 
-KINDS: dict[str, Callable[[str, Path, list[Claim], str], str]] = {"sentences": _sentences, "ledger": _ledger}
+KINDS: dict[str, Callable[[str, Path, list[Claim], str], str]] = {
+    "figure": _figure,
+    "sentences": _sentences,
+    "ledger": _ledger,
+}
 
 
 if __name__ == "__main__":
