@@ -20,7 +20,7 @@ from dadiff.behaviours.projection import Projection, ProjectionInfo, check_shape
 from dadiff.behaviours.sets import Dynamics
 from dadiff.errors import NotApplicableError
 from dadiff.experts.limited_ilqr import MISSED, LimitedTracking, solve
-from dadiff.experts.nearest import Limits, Status, nearest, within
+from dadiff.experts.nearest import Limits, Status, compile_kernels, nearest, within
 from dadiff.systems.system import Bounds
 from dadiff.trajectory.arrays import Array
 from dadiff.trajectory.coordinates import Coordinates, physical
@@ -97,6 +97,7 @@ class LimitedProjection(Projection):
         self._shape = (*target.dynamics.robots, target.layout.size)
         self._unlimited = target.dynamics.bind(where, pins)
         self.info = ProjectionInfo(self._unlimited.info.rank, "limited")
+        compile_kernels()
 
     def __call__(
         self, tau: Array, metric: Covariance | None = None, start: Array | None = None, noise: Array | None = None

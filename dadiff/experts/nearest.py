@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
+from functools import cache
 
 import numpy as np
 
@@ -193,6 +194,14 @@ def nearest(
     problem = kernels.Problem(s_hat, weight, low, high, F, c, normal, offset, *limits.axes)
     kernels.nearest(problem, s, multiplier, status, iterations, TOLERANCE, ITERATIONS)
     return Nearest(layout.flatten(s[..., :n], s[:, :T, n:]), status, iterations, multiplier)
+
+
+@cache
+def compile_kernels() -> None:
+    """Find one trajectory: machine code is made by the first call on a machine, which is not to be timed."""
+    layout = TrajectoryLayout(2, 1, 2)
+    A, B, c = np.tile(np.eye(2), (2, 1, 1)), np.ones((2, 2, 1)), np.zeros((2, 2))
+    nearest(layout, np.ones((1, layout.size)), A, B, c, Limits.nothing(layout, 1))
 
 
 def _by_time(layout: TrajectoryLayout, tau: np.ndarray, last: float) -> np.ndarray:
