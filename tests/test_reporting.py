@@ -575,6 +575,7 @@ def test_a_drawing_in_fewer_bytes_is_the_same_drawing():
     small = slim.drawing(drawn)
     assert len(small) < 0.75 * len(drawn)
     assert slim.drawing(small) == small
+    assert b"<text>0.00632 of 1.2345 </text>" in slim.drawing(b"<svg><text>0.00632 of 1.2345 </text></svg>")
     before, after = (ElementTree.fromstring(content) for content in (drawn, small))
     places = [
         [(float(use.get("x")), float(use.get("y"))) for use in tree.iter("{http://www.w3.org/2000/svg}use")]

@@ -17,12 +17,13 @@ def drawing(svg: bytes) -> bytes:
     """An SVG with coordinates to a hundredth of a point, styles once a group, and no blanks between its elements."""
     text = re.sub(r"<metadata>.*?</metadata>|<!--.*?-->", "", svg.decode(), flags=re.DOTALL)
     text = re.sub(r' transform="rotate\(-?0 [^"]*"', "", text)
-    text = re.sub(r'(?<=[ "(,])-?\d+\.\d{3,}(?=[ "),\n])', lambda found: f"{float(found[0]):.2f}", text)
+    text = re.sub("<[^>]*>", lambda tag: COORDINATE.sub(lambda found: f"{float(found[0]):.2f}", tag[0]), text)
     text = re.sub(r'(?<=style=")[^"]*', lambda found: re.sub("([;:,]) ", r"\1", found[0]), text)
     text = re.sub(r'(?<= d=")[^"]*', lambda found: _path(found[0]), text)
     return MARKERS.sub(_shared, _short_ids(re.sub(r">\s+<", "><", text))).encode()
 
 
+COORDINATE = re.compile(r'(?<=[ "(,])-?\d+\.\d{3,}(?=[ "),\n])')
 MARKERS = re.compile(r"<g(?P<own>(?: [\w-]+=\"[^\"]*\")*)>(?P<marks>(?:<use [^>]*/>)+)</g>")
 STYLE = re.compile(r' style="([^"]*)"')
 

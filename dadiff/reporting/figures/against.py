@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 
 from dadiff.reporting.aggregation import Evidence, Method, has_metric, pair, varying
 from dadiff.reporting.figures.style import (
+    PANEL_WIDTH,
     Look,
     at_the_edge,
     drawn,
@@ -30,6 +31,9 @@ from dadiff.reporting.figures.style import (
 from dadiff.reporting.labels import FLOORS, ROUNDING, axis_name, axis_value, method_name, metric_name
 from dadiff.reporting.selection import Selector
 from dadiff.reporting.statistics import Estimate, mean, ratio
+
+ALONE = 1.7
+"""Width of the only panel, which has room for names beside it."""
 
 MARKS = ((0, (1, 1.5)), (0, (4, 1.5, 1, 1.5)), (0, (7, 2)))
 """Dashes of marked places."""
@@ -68,7 +72,8 @@ class Against:
 
     def draw(self, columns: int) -> Figure:
         """One panel a metric and condition, both axes logarithmic."""
-        figure, axes = panels(len(self.panels), columns)
+        width = PANEL_WIDTH * (ALONE if columns > 1 and len(self.panels) == 1 else 1)
+        figure, axes = panels(len(self.panels), columns, width=width)
         for ax, panel in zip(axes, self.panels, strict=True):
             _draw_panel(ax, panel, labelled=columns > 1)
             self._mark(ax)
