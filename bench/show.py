@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import itertools
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +24,12 @@ def slope(row: Row) -> float | None:
 
 def table(rows: Sequence[Row]) -> str:
     """One line a row: ours, the other's, and how many times faster; or the exponent of a cost over sizes."""
-    lines = [f"{'':<46}{'ours':>12}{'other':>12}{'ratio':>9}  against"]
+    wide = max([46, *(len(row.name) + 1 for row in rows)])
+    lines = [f"{'':<{wide}}{'ours':>12}{'other':>12}{'ratio':>9}  against"]
     for row in rows:
         other = "" if row.other is None else f"{row.other:.4g} {row.unit}"
         ratio = "" if row.ratio is None else f"{row.ratio:.2f}"
-        lines.append(f"{row.name:<46}{row.value:>9.4g} {row.unit:<2}{other:>12}{ratio:>9}  {told(row)}")
+        lines.append(f"{row.name:<{wide}}{row.value:>9.4g} {row.unit:<2}{other:>12}{ratio:>9}  {told(row)}")
     return "\n".join(lines)
 
 
@@ -46,7 +48,10 @@ def told(row: Row) -> str:
     """What it is compared with, or how it grows."""
     if (exponent := slope(row)) is None:
         return row.against
-    return f"grows with exponent {exponent:.2f} over sizes {row.points[0][0]:g} to {row.points[-1][0]:g}"
+    last = slope(replace(row, points=row.points[-2:]))
+    ends = f"{row.points[0][0]:g} to {row.points[-1][0]:g}"
+    at_the_end = f", {last:.2f} at the end" if len(row.points) > 2 else ""
+    return f"grows with exponent {exponent:.2f} over sizes {ends}{at_the_end}"
 
 
 def draw(rows: Sequence[Row], file: Path) -> None:
@@ -83,8 +88,8 @@ def _draw_ratios(ax: Any, rows: Sequence[Row]) -> None:
         ax.annotate(text, (max(ratio, 1), place), (4, 0), **look)
     ax.set_yticks(places, [f"{row.name}\nagainst {row.against}" for row in rows], fontsize=7)
     ax.axvline(1, color="0.2", linewidth=0.8)
-    ax.set(xlabel="times faster than the other (below 1: a floor)")
-    ax.set_xlim(0.5, 3 * max([1.0, *ratios]))
+    ax.set(xlabel="times faster than the other, below 1 slower")
+    ax.set_xlim(min([0.5, *(ratios / 2)]), 3 * max([1.0, *ratios]))
     ax.invert_yaxis()
 
 
