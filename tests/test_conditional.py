@@ -198,6 +198,22 @@ def test_Sigma_of_demonstrations_is_what_regression_on_E_leaves():
     np.testing.assert_allclose(channels, np.broadcast_to(channels[0], channels.shape))
 
 
+def test_few_demonstrations_are_counted_without_the_freedom_that_regression_takes():
+    rng = np.random.default_rng(3)
+    E, layout = rng.standard_normal((9, 3)), TrajectoryLayout(1, 1, 2)
+    tau, where = rng.standard_normal((9, layout.size)), Coordinates(np.ones(layout.size), np.full(layout.size, 2.0))
+    made = Estimate.of_demonstrations(layout, where, tau, E)
+    design = np.column_stack([E, np.ones(9)])
+    left = (tau - design @ np.linalg.lstsq(design, tau, rcond=None)[0]) / 2
+    np.testing.assert_allclose(made.covariance, left.T @ left / (9 - 3 - 1), atol=1e-12)
+    np.testing.assert_allclose(made.physical.matrix, np.eye(layout.size) / 4)
+
+
+def test_nothing_is_left_open_of_a_certain_entry_that_is_seen_without_noise():
+    made = Estimate(np.diag([0.0, 1.0]), np.ones(2), np.ones(2))
+    np.testing.assert_array_equal(made.diagonal(1.0).matrix, np.zeros((2, 2)))
+
+
 def test_equal_questions_get_the_one_object_so_that_projections_are_made_once():
     made = estimate(law())
     assert made.at(0.3, 0.1) is made.at(0.3, 0.1)

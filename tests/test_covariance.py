@@ -49,6 +49,11 @@ class TestAlgebra:
         np.testing.assert_allclose(z.swapaxes(-1, -2) @ z / 40_000, C.matrix, atol=0.03 * np.abs(C.matrix).max())
 
 
+def test_a_draw_takes_no_more_noise_than_there_are_directions(rng):
+    C, eps, more = some(2), rng.standard_normal((3, SIZE)), rng.standard_normal((3, SIZE))
+    np.testing.assert_allclose(C.colour(eps, more), eps * np.sqrt(C.diagonal) + more[:, :2] @ C.factor.T, atol=1e-14)
+
+
 def test_a_dense_matrix_is_one(rng):
     root = rng.standard_normal((SIZE, 3))
     np.testing.assert_allclose(Covariance.dense(root @ root.T).matrix, root @ root.T, atol=1e-12)

@@ -219,6 +219,9 @@ class TestBadInput:
         with pytest.raises(ConfigError, match=text):
             Fleet(**changes)
 
+    def test_one_robot_to_learn_from_and_one_to_test_is_a_fleet(self):
+        assert Fleet(robots=1, interpolation=1, extrapolation=0).robots == 1
+
     def test_no_room_to_extrapolate(self):
         with pytest.raises(ConfigError, match="no room outside"):
             fleet_for(self.family).target(DampedIntegrators(damping=(0, 0), gain=(0, 0)))

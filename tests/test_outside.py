@@ -18,6 +18,7 @@ from laws import composed
 from dadiff import memory
 from dadiff.datasets import NpzRecordings, NpzTrajectories
 from dadiff.datasets.environments import load_environments
+from dadiff.denoisers import RecordingMLP
 from dadiff.errors import ConfigError, DadiffError, DataError, StoreError
 from dadiff.outside import digest_of, npz, spreadsheet_safe, text_of, without_passwords, yaml_of
 from dadiff.running.parts import Parts
@@ -127,6 +128,12 @@ DECLARED = (
     "training.batch_size",
     "system.axes",
 )
+
+
+def test_a_network_that_reads_recordings_is_held_against_memory(monkeypatch):
+    monkeypatch.setattr("dadiff.memory.available", lambda: 1e8)
+    with pytest.raises(ConfigError, match="width=10000"):
+        RecordingMLP(width=10_000)
 
 
 @pytest.mark.timeout(10)

@@ -88,6 +88,12 @@ def test_pseudo_inverse_guidance_is_the_gradient_of_the_likelihood_of_the_pseudo
     assert at.denoise.calls == 1
 
 
+@pytest.mark.parametrize("at_once", [1, 8192])
+def test_the_jacobian_is_the_same_however_many_directions_are_taken_at_once(at_once, monkeypatch):
+    monkeypatch.setattr("dadiff.diffusion.context.AT_ONCE", at_once)
+    close(context().jacobian(), jacobian().expand(*TAU.shape, SIZE))
+
+
 def test_tmpd_of_an_exact_denoiser_is_the_conditional_projection():
     found = TMPD().clean(TAU0, context())
     close(found, Conditional(floor=0.0, shrinkage=0.0).clean(TAU0, context()))

@@ -41,6 +41,12 @@ def test_the_papers_schedule_satisfies_all_its_conditions():
     assert schedule.conditions() == {"C1": True, "C2": True, "C3": True}
 
 
+def test_a_schedule_that_ends_in_1_up_to_rounding_ends_in_1():
+    assert 49 * (1 / 49) != 1
+    assert paper_linear(49, 1 / 49).beta[-1] == 1
+    assert paper_linear(49, 0.5 / 49).beta[-1] == pytest.approx(0.5)
+
+
 def test_the_usual_schedules_do_not_reach_beta_1():
     assert ddpm_linear().conditions() == {"C1": False, "C2": True, "C3": True}
     assert cosine().conditions() == {"C1": False, "C2": True, "C3": True}

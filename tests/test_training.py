@@ -14,7 +14,7 @@ from safetensors.torch import load_file
 
 from dadiff.denoisers import MLP, EncoderDecoder, learning
 from dadiff.denoisers.checkpoints import load
-from dadiff.denoisers.learning import Data, train
+from dadiff.denoisers.learning import Data, Objective, train
 from dadiff.denoisers.recipes import Recipe
 from dadiff.denoisers.training import Training
 from dadiff.diffusion.schedule import paper_linear
@@ -278,6 +278,26 @@ def test_rounded_products_learn_as_well(recipe, tmp_path):
         denoiser = run(tmp_path / precision, recipe, replace(training, precision=precision))
         errors[precision] = float((denoiser(noise, SCHEDULE.num_steps, E) - tau).square().mean())
     assert errors["bfloat16"] < 1.25 * errors["float32"]
+
+
+def test_the_loss_is_that_of_the_forward_process():
+    """|tau_0 - f(sqrt(alpha_bar_i) tau_0 + sqrt(1 - alpha_bar_i) eps)|^2 of a prediction of the clean trajectory."""
+    rng = np.random.default_rng(0)
+    tau0, eps, i = rng.standard_normal((7, 4)), rng.standard_normal((7, 4)), np.array([1, 2, 30, 50, 80, 99, 100])
+    objective = Objective(MLP(prediction="clean"), SCHEDULE, replace(SHORT, loss_weight="uniform"), "cpu")
+    a = SCHEDULE.alpha_bar[i][:, None]
+    seen = np.sqrt(a) * tau0 + np.sqrt(1 - a) * eps
+
+    class Halved:
+        def output(self, tau, step, environment):
+            return tau / 2
+
+    found = objective(Halved(), *(torch.tensor(v) for v in (tau0, np.zeros((7, 1)), i, eps)))
+    assert float(found) == pytest.approx(np.square(seen / 2 - tau0).mean(), rel=1e-5)
+
+
+def test_a_training_may_begin_at_full_rate():
+    assert Training(warmup=0).warmup == 0
 
 
 def test_every_step_is_drawn_and_none_beyond():
