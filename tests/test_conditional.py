@@ -198,14 +198,15 @@ def test_Sigma_of_demonstrations_is_what_regression_on_E_leaves():
     np.testing.assert_allclose(channels, np.broadcast_to(channels[0], channels.shape))
 
 
-def test_few_demonstrations_are_counted_without_the_freedom_that_regression_takes():
+@pytest.mark.parametrize("count", [5, 9])
+def test_few_demonstrations_are_counted_without_the_freedom_that_regression_takes(count):
     rng = np.random.default_rng(3)
-    E, layout = rng.standard_normal((9, 3)), TrajectoryLayout(1, 1, 2)
-    tau, where = rng.standard_normal((9, layout.size)), Coordinates(np.ones(layout.size), np.full(layout.size, 2.0))
+    E, layout = rng.standard_normal((count, 3)), TrajectoryLayout(1, 1, 2)
+    tau, where = rng.standard_normal((count, layout.size)), Coordinates(np.ones(layout.size), np.full(layout.size, 2.0))
     made = Estimate.of_demonstrations(layout, where, tau, E)
-    design = np.column_stack([E, np.ones(9)])
+    design = np.column_stack([E, np.ones(count)])
     left = (tau - design @ np.linalg.lstsq(design, tau, rcond=None)[0]) / 2
-    np.testing.assert_allclose(made.covariance, left.T @ left / (9 - 3 - 1), atol=1e-12)
+    np.testing.assert_allclose(made.covariance, left.T @ left / (count - 3 - 1), atol=1e-12)
     np.testing.assert_allclose(made.physical.matrix, np.eye(layout.size) / 4)
 
 
