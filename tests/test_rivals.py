@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import sqrt
 
 import numpy as np
 import pytest
 import torch
-from test_conditional import SCHEDULE, SIZE, WHERE, constraint, estimate, law
+from test_conditional import LAYOUT, SCHEDULE, SIZE, WHERE, constraint, estimate, law
 
 from dadiff.denoisers.exact import ExactDenoiser
 from dadiff.diffusion.conditional import Conditional
 from dadiff.diffusion.context import Context, Counted
+from dadiff.diffusion.estimate import Estimate
 from dadiff.diffusion.rivals import (
     DPS,
     MCG,
@@ -23,6 +25,8 @@ from dadiff.diffusion.rivals import (
     ProjectedSamples,
     Replacement,
     RolloutBlend,
+    Selected,
+    Tracked,
 )
 from dadiff.diffusion.samplers import DDIM
 from dadiff.errors import ConfigError, NotApplicableError
@@ -173,6 +177,36 @@ def test_gradients_need_a_denoiser_that_has_them(enforcement):
 def test_parameters_without_meaning_are_refused(make):
     with pytest.raises(ConfigError, match="it must lie in"):
         make()
+
+
+def test_a_tracked_plan_is_the_solution_of_the_quadratic_programme():
+    """min sum q |x - x_hat|^2 + r |u - u_hat|^2 within G tau = g, in physical units, by its optimality conditions."""
+    made = estimate(law())
+    at = replace(context(), estimate=Estimate(made.covariance, made.deviation, made.unit, LAYOUT))
+    weights = np.full(SIZE, 0.2)
+    weights[LAYOUT.all_states] = 3.0
+    *_, G, g, _ = constraint("pinned")
+    wanted, W = WHERE.to_physical(TAU.numpy()), np.diag(weights)
+    conditions = np.block([[W, G.T], [G, np.zeros((len(G), len(G)))]])
+    right = np.concatenate([wanted @ W, np.tile(g, (PLANS, 1))], axis=-1)
+    expected = np.linalg.solve(conditions, right.T).T[:, :SIZE]
+    close(WHERE.to_physical(Tracked(3.0, 0.2).end(TAU, at).numpy()), expected)
+    with pytest.raises(ConfigError, match="which entries are states is not known"):
+        Tracked().end(TAU, context())
+
+
+def test_of_the_plans_for_one_case_that_is_selected_which_was_moved_least():
+    rival, moved = Selected(0.0), 0.0
+    E = torch.tensor([[0.0, 1.0], [0.0, 1.0], [2.0, 1.0]], dtype=torch.float64)
+    at = replace(context(), environment=E)
+    for tau in (TAU, EPS):
+        close(rival.sample(tau, at), corrected(tau, IDENTITY))
+        moved = moved + (corrected(tau, IDENTITY) - tau).norm(dim=-1)
+    best = int(moved[:2].argmin())
+    close(rival.end(TAU, at), TAU[[best, best, 2]])
+    fleet = replace(at, environment=E[None].expand(2, -1, -1), memory={"moved": torch.stack([moved, -moved])})
+    plans = torch.stack([TAU, EPS])
+    close(rival.end(plans, fleet), torch.stack([TAU[[best, best, 2]], EPS[[1 - best, 1 - best, 2]]]))
 
 
 def test_a_metric_for_each_plan_projects_each_plan_in_its_own():

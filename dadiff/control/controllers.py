@@ -3,6 +3,7 @@
 OpenLoop         the planned inputs, without looking (replay)
 Tracking         a plan, and gains that hold the state to it
 Feedback         u = K_t x + k_t: an optimal controller, as yardstick
+Cloned           what demonstrations do in a state, by regression: behaviour cloning
 RecedingHorizon  plans anew every k steps from where the robot is
 """
 
@@ -17,7 +18,9 @@ import numpy as np
 
 from dadiff.errors import ConfigError, ShapeError
 from dadiff.systems.system import System
+from dadiff.trajectory.layout import TrajectoryLayout
 from dadiff.trajectory.response import along
+from dadiff.trajectory.subspace import regression
 
 Trajectories = tuple[np.ndarray, np.ndarray]
 """Planned states (*robots, ..., T+1, n) and inputs (*robots, ..., T, m)."""
@@ -82,6 +85,48 @@ class Feedback:
     def act(self, t: int, x: np.ndarray) -> np.ndarray:
         """See the class."""
         return along(self.gain, x) + self.offset
+
+
+@dataclass
+class Cloned:
+    """Behaviour cloning (Pomerleau 1988): u(t) = K_t [x(t); goal] + k_t; beyond the horizon as at its end.
+
+    Args:
+        gains: K, (T, m, n + c).
+        offsets: k, (T, m).
+        goal: what else the inputs depend on, (*robots, ..., c).
+
+    Attributes:
+        seconds: processor time of each input, for the whole batch.
+    """
+
+    gains: np.ndarray = field(repr=False)
+    offsets: np.ndarray = field(repr=False)
+    goal: np.ndarray = field(repr=False)
+    seconds: list[float] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, layout: TrajectoryLayout, trajectories: np.ndarray, shown: np.ndarray, goal: np.ndarray) -> Cloned:
+        """By least squares at each time.
+
+        Args:
+            trajectories: (N, d), of demonstrations.
+            shown: what their inputs depend on besides the state, (N, c).
+        """
+        x, u = layout.split(trajectories)
+        gains, offsets = [], []
+        for t in range(layout.horizon):
+            coefficients, intercept, _ = regression(u[:, t], np.concatenate([x[:, t], shown], axis=-1))
+            gains.append(coefficients.T)
+            offsets.append(intercept)
+        return cls(np.stack(gains), np.stack(offsets), goal)
+
+    def act(self, t: int, x: np.ndarray) -> np.ndarray:
+        """See the class."""
+        begun, t = time.process_time(), min(t, len(self.gains) - 1)
+        u = np.concatenate([x, self.goal], axis=-1) @ self.gains[t].T + self.offsets[t]
+        self.seconds.append(time.process_time() - begun)
+        return u
 
 
 @dataclass

@@ -14,6 +14,6 @@ A denoiser is called as `tau0_hat = denoiser(tau, i, environment)` with float64 
 sampler's coordinates, the diffusion step i in 1..L, and E (..., c) in physical units.
 """
 
-from dadiff.denoisers.recipes import MLP, EncoderDecoder, Gaussian, MomentMatched, RecordingMLP
+from dadiff.denoisers.recipes import MLP, EncoderDecoder, Gaussian, InputsMLP, MomentMatched, RecordingMLP
 
-__all__ = ["MLP", "EncoderDecoder", "Gaussian", "MomentMatched", "RecordingMLP"]
+__all__ = ["MLP", "EncoderDecoder", "Gaussian", "InputsMLP", "MomentMatched", "RecordingMLP"]

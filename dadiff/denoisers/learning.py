@@ -28,7 +28,7 @@ from dadiff.denoisers.description import Description
 from dadiff.denoisers.learned import NetworkDenoiser
 from dadiff.denoisers.prediction import loss_weights, prediction
 from dadiff.denoisers.recipes import Recipe
-from dadiff.denoisers.training import Training
+from dadiff.denoisers.training import InformedTraining, Training
 from dadiff.diffusion.schedule import Schedule
 from dadiff.errors import DataError, ShapeError
 from dadiff.randomness import torch_generator
@@ -54,6 +54,7 @@ def train(
     device: str = "cpu",
     augment: Augment | None = None,
     *,
+    dynamics: tuple[np.ndarray, np.ndarray] | None = None,
     progress: bool = True,
 ) -> NetworkDenoiser:
     """The denoiser trained on demonstrations; continues from `folder/checkpoint.safetensors` where there is one.
@@ -66,6 +67,7 @@ def train(
         trajectories: (N, d), in the sampler's coordinates.
         environment: (N, c), in physical units.
         augment: maps a batch of E (B, c) to an equivalent one, drawing from the given generator.
+        dynamics: G (q, d) and g (q,) in the sampler's coordinates, of an `InformedTraining`.
 
     Raises:
         ShapeError, DataError: if the arrays disagree with the layout or hold values that are not finite.
@@ -73,6 +75,8 @@ def train(
     """
     _check_data(layout, condition, trajectories, environment)
     objective = Objective(recipe, schedule, training, device)
+    if isinstance(training, InformedTraining) and dynamics is not None:
+        objective = InformedObjective(recipe, schedule, training, device, *dynamics)
     data = Data(trajectories, environment, schedule.num_steps, training, device, augment)
     state = State(_untrained(recipe, layout, condition, schedule, training, environment).to(device), training)
     checkpoint = folder / "checkpoint.safetensors"
@@ -109,17 +113,48 @@ class Objective:
         alpha_bar, table = schedule.alpha_bar, prediction(recipe.prediction, schedule)
         weight = loss_weights(training.loss_weight, schedule, table)
         columns = [np.sqrt(alpha_bar), np.sqrt(1 - alpha_bar), table.target_clean, table.target_noise, weight]
+        columns += [table.estimate_tau, table.estimate_output]
         self._columns = torch.from_numpy(np.stack(columns, axis=-1)).float().to(device)
         self._device, self._rounded = torch.device(device).type, training.precision == "bfloat16"
 
     def __call__(self, denoiser: NetworkDenoiser, tau0: Tensor, E: Tensor, i: Tensor, eps: Tensor) -> Tensor:
         """Mean over a batch: tau0 and eps (B, d), E (B, c), i (B,)."""
-        a, s, clean, noise, weight = self._columns[i, :, None].unbind(1)
-        tau = a * tau0 + s * eps
+        a, s, clean, noise, weight, *_ = self._columns[i, :, None].unbind(1)
         target = clean * tau0 + noise * eps
+        return (weight * (self._output(denoiser, a * tau0 + s * eps, i, E) - target) ** 2).mean()
+
+    def _output(self, denoiser: NetworkDenoiser, tau: Tensor, i: Tensor, E: Tensor) -> Tensor:
         with torch.autocast(self._device, torch.bfloat16, enabled=self._rounded):
             output = denoiser.output(tau, i, E)
-        return (weight * (output.float() - target) ** 2).mean()
+        return output.float()
+
+
+class InformedObjective(Objective):
+    """The squared error of the clean estimate, which is projected onto G tau = g or pays for its distance from it."""
+
+    def __init__(
+        self,
+        recipe: Recipe,
+        schedule: Schedule,
+        training: InformedTraining,
+        device: str,
+        G: np.ndarray,
+        g: np.ndarray,
+    ) -> None:
+        super().__init__(recipe, schedule, training, device)
+        inverse = np.linalg.pinv(G)
+        matrices = (G, g, np.eye(G.shape[-1]) - inverse @ G, inverse @ g)
+        self._G, self._g, self._P, self._origin = (torch.from_numpy(M).float().to(device) for M in matrices)
+        self._residual_weight, self._projects = training.residual_weight, training.projects
+
+    def __call__(self, denoiser: NetworkDenoiser, tau0: Tensor, E: Tensor, i: Tensor, eps: Tensor) -> Tensor:
+        """As of `Objective`."""
+        a, s, *_, from_tau, from_output = self._columns[i, :, None].unbind(1)
+        tau = a * tau0 + s * eps
+        tau0_hat = from_tau * tau + from_output * self._output(denoiser, tau, i, E)
+        estimate = tau0_hat @ self._P.T + self._origin if self._projects else tau0_hat
+        residual = tau0_hat @ self._G.T - self._g
+        return (estimate - tau0).square().mean() + self._residual_weight * residual.square().mean()
 
 
 class Data:

@@ -57,9 +57,9 @@ class ResidualBlock(nn.Module):
 class ResidualNetwork(nn.Module):
     """Residual blocks on [tau, step features, E]; a first layer that adds three maps is one map of the three joined."""
 
-    def __init__(self, size: int, environment_dim: int, width: int, blocks: int) -> None:
+    def __init__(self, size: int, environment_dim: int, width: int, blocks: int, seen: int | None = None) -> None:
         super().__init__()
-        self.trajectory = nn.Linear(size, width)
+        self.trajectory = nn.Linear(size if seen is None else seen, width)
         self.step = nn.Linear(STEP_FEATURES, width)
         self.environment = nn.Linear(environment_dim, width)
         self.blocks = nn.Sequential(*(ResidualBlock(width) for _ in range(blocks)))
@@ -68,6 +68,18 @@ class ResidualNetwork(nn.Module):
     def forward(self, tau: Tensor, step: Tensor, environment: Tensor) -> Tensor:
         hidden = self.trajectory(tau) + self.step(step_features(step)) + self.environment(environment)
         return self.output(self.blocks(hidden))
+
+
+class InputsNetwork(nn.Module):
+    """`ResidualNetwork` that sees the inputs of tau alone, whatever its states."""
+
+    def __init__(self, layout: TrajectoryLayout, environment_dim: int, width: int, blocks: int) -> None:
+        super().__init__()
+        self.layout, seen = layout, layout.horizon * layout.input_dim
+        self.plan = ResidualNetwork(layout.size, environment_dim, width, blocks, seen)
+
+    def forward(self, tau: Tensor, step: Tensor, environment: Tensor) -> Tensor:
+        return self.plan(self.layout.inputs(tau).flatten(-2), step, environment)
 
 
 class RecordingNetwork(nn.Module):

@@ -137,6 +137,34 @@ class MLP:
 
 
 @dataclass(frozen=True)
+class InputsMLP(MLP):
+    """`MLP` that sees the inputs alone: a diffusion over u given E. It predicts clean trajectories.
+
+    With `projector=rollout enforcement=clean_estimate` states follow from x_init and the inputs at every step, so that
+    dynamics hold exactly without a projection: diffusion in the subspace of the behaviour.
+    """
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.prediction != "clean":
+            raise ConfigError(
+                f"denoiser mlp_inputs: prediction is {self.prediction}; noise of states that it does not see cannot "
+                "be predicted: use clean"
+            )
+
+    def build(
+        self, layout: TrajectoryLayout, condition: Layout, schedule: Schedule, generator: torch.Generator
+    ) -> NetworkDenoiser:
+        """See `Recipe.build`."""
+        from dadiff.denoisers.learned import NetworkDenoiser, on_meta
+        from dadiff.denoisers.networks import InputsNetwork
+
+        with on_meta():
+            network = InputsNetwork(layout, condition.size, self.width, self.blocks)
+        return NetworkDenoiser(network, self, layout, condition, schedule, generator)
+
+
+@dataclass(frozen=True)
 class RecordingMLP:
     """`MLP` for an E that holds a `recording`, the transitions of a short one: learns to identify the robot.
 

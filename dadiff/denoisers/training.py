@@ -65,3 +65,25 @@ class Training:
     def ema_decay_at(self, step: int) -> float:
         """The decay of the running mean, smaller at first so that the initial weights are soon forgotten."""
         return min(self.ema_decay, (1 + step) / (10 + step))
+
+
+@dataclass(frozen=True)
+class InformedTraining(Training):
+    """As `Training`, told of the dynamics x(t+1) = A x(t) + B u(t) + c that demonstrations obey on the whole.
+
+    They are found by least squares, so that of many robots they are those of an average one.
+
+    Args:
+        residual_weight: of the mean square of G tau0_hat - g, added to the loss: physics-informed diffusion models
+            (Bastek, Sun & Kochmann 2025).
+        projects: the loss is that of P(tau0_hat), with P the orthogonal projection onto the trajectories of those
+            dynamics: projection within training, as of DDAT (Bouvier et al. 2025).
+    """
+
+    residual_weight: float = 0.0
+    projects: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0 <= self.residual_weight < math.inf:
+            raise ConfigError(f"training: residual_weight is {self.residual_weight}; it must be finite and at least 0")

@@ -36,13 +36,15 @@ class Estimate:
         covariance: Sigma of shape (*robots, d, d).
         deviation: of the standardised channels, entry by entry, (d,).
         unit: the length of a physical unit, entry by entry, (d,).
+        layout: of trajectories, for weights of states and inputs.
     """
 
     covariance: np.ndarray = field(repr=False)
     deviation: np.ndarray = field(repr=False)
     unit: np.ndarray = field(repr=False)
+    layout: TrajectoryLayout | None = None
     _spectra: dict[float, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict, init=False, repr=False)
-    _made: dict[tuple[float, ...], Covariance] = field(default_factory=dict, init=False, repr=False)
+    _made: dict[tuple[object, ...], Covariance] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
         d = self.deviation.shape[-1]
@@ -77,7 +79,7 @@ class Estimate:
     ) -> Estimate:
         """A known Sigma (*robots, d, d) in the given coordinates; the channels' deviations from trajectories (N, d)."""
         deviation = standardised(layout, trajectories).scale / coordinates.scale
-        return cls(covariance, deviation, 1 / coordinates.scale)
+        return cls(covariance, deviation, 1 / coordinates.scale, layout)
 
     def at(self, alpha_bar: float, floor: float = 0.0, shrinkage: float = 0.0, directions: int = 0) -> Covariance:
         """C_i + floor Sigma where alpha_bar_i is alpha_bar; one object for equal arguments.
@@ -97,7 +99,7 @@ class Estimate:
         """C_i + floor Sigma of diag(Sigma): each entry for itself."""
         return self._kept((alpha_bar, floor), self._diagonal)
 
-    def _kept(self, key: tuple[float, ...], make: Callable[..., Covariance]) -> Covariance:
+    def _kept(self, key: tuple[object, ...], make: Callable[..., Covariance]) -> Covariance:
         if key not in self._made:
             if len(self._made) == KEPT:
                 del self._made[next(iter(self._made))]
@@ -118,6 +120,20 @@ class Estimate:
     def physical(self) -> Covariance:
         """Equal variances in physical units."""
         return Covariance.diagonal_of(self.unit**2)
+
+    def weighted(self, state_weight: float, input_weight: float) -> Covariance:
+        """Variances 1 / q of states and 1 / r of inputs, in physical units.
+
+        Raises:
+            ConfigError: if it is not known which entries are states.
+        """
+        if self.layout is None:
+            raise ConfigError("estimate: which entries are states is not known; make it with a layout")
+        weight = np.full(self.size, input_weight)
+        weight[self.layout.all_states] = state_weight
+        return self._kept(
+            ("weighted", state_weight, input_weight), lambda *_: Covariance.diagonal_of(self.unit**2 / weight)
+        )
 
     def _at(self, alpha_bar: float, floor: float, shrinkage: float, directions: int) -> Covariance:
         variance, basis = self._spectrum(shrinkage)

@@ -7,7 +7,9 @@ residual is that of the set, tau0_hat - P(tau0_hat), which does not depend on ho
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from math import sqrt
+from typing import ClassVar
 
 from dadiff.diffusion.context import Context
 from dadiff.diffusion.enforcement import Never
@@ -16,6 +18,8 @@ from dadiff.diffusion.schedule import Schedule
 from dadiff.errors import ConfigError
 from dadiff.trajectory.arrays import Array
 from dadiff.trajectory.covariance import Covariance
+
+TINY = 1e-12
 
 
 def _check(name: str, value: float, low: float, high: float) -> None:
@@ -46,6 +50,69 @@ class ProjectedSamples(Never):
     def keeps(self, schedule: Schedule, j: int) -> float | None:
         """Nothing of the displacement where it acts."""
         return 0.0 if float(schedule.alpha_bar[j]) >= self.signal else 1.0
+
+
+@dataclass(frozen=True)
+class Selected(ProjectedSamples):
+    """As `ProjectedSamples`, and of all plans for one E the one is taken that was moved least.
+
+    The selection of diffusion predictive control with constraints (Römer et al. 2024): least sum over steps of
+    |P(tau_j) - tau_j|. Every plan for that E becomes the selected one.
+    """
+
+    signal: float = 0.5
+
+    def sample(self, tau: Array, at: Context) -> Array:
+        """P(tau), where it acts; what it moved is kept."""
+        projected = super().sample(tau, at)
+        at.memory["moved"] = at.memory.get("moved", 0.0) + ((projected - tau) ** 2).sum(-1) ** 0.5
+        return projected
+
+    def end(self, tau: Array, at: Context) -> Array:
+        """The selected plans: those for one E follow one another."""
+        moved, chosen = at.memory["moved"], 0 * tau
+        for first, last in _alike(at.environment):
+            least = moved[..., first:last].argmin(-1)[..., None, None]
+            best = (tau[..., first:last, :] * (_places(tau[..., first:last, :]) == least)).sum(-2)
+            chosen[..., first:last, :] = best[..., None, :]
+        return chosen
+
+
+def _alike(environment: Array) -> list[tuple[int, int]]:
+    """Where plans for one E begin and end, of E (*robots, plans, c) in which they follow one another."""
+    plans = environment.shape[-2]
+    rows = environment.reshape(-1, plans, environment.shape[-1])
+    begins = [0, *(k for k in range(1, plans) if bool((rows[:, k] != rows[:, k - 1]).any()))]
+    return list(pairwise([*begins, plans]))
+
+
+def _places(plans: Array) -> Array:
+    """0, 1, ... for each of plans (..., count, d), as (count, 1)."""
+    return (0 * plans[..., :1] + 1).cumsum(-2) - 1
+
+
+@dataclass(frozen=True)
+class Tracked(Never):
+    """The vanilla plan is tracked: min sum_t q |x(t) - x_hat(t)|^2 + r |u(t) - u_hat(t)|^2 within the set, at the end.
+
+    What a tracking controller with a model makes of a plan; with `projector.bounds=enforced` a quadratic programme.
+
+    Args:
+        state_weight, input_weight: q and r, in physical units.
+    """
+
+    weighs: ClassVar[bool] = True
+
+    state_weight: float = 1.0
+    input_weight: float = 0.01
+
+    def __post_init__(self) -> None:
+        _check("state_weight", self.state_weight, TINY, float("inf"))
+        _check("input_weight", self.input_weight, TINY, float("inf"))
+
+    def end(self, tau: Array, at: Context) -> Array:
+        """P(tau) in the metric of the weights' inverses."""
+        return at.project(tau, at.known_estimate().weighted(self.state_weight, self.input_weight))
 
 
 @dataclass(frozen=True)

@@ -16,14 +16,14 @@ import numpy as np
 import pandas as pd
 
 from dadiff.behaviours import model_of
-from dadiff.control import Controller, Episode, OpenLoop, RecedingHorizon, Tracking, run
+from dadiff.control import Cloned, Controller, Episode, OpenLoop, RecedingHorizon, Tracking, run
 from dadiff.control.controllers import Trajectories, tracking_gains
 from dadiff.errors import ConfigError, NotApplicableError
 from dadiff.evaluation.settings import ClosedLoop, ControllerChoice
 from dadiff.planning import Planner, Plans
 from dadiff.randomness import numpy_generator
 from dadiff.systems import System, TimeVarying
-from dadiff.tasks.task import Cases, Steering
+from dadiff.tasks.task import Cases, Demonstrations, Steering
 
 TIMED_PLANS, TIMED_SECONDS = 100, 2.0  # plans of one case, one at a time, for the latency
 
@@ -36,11 +36,13 @@ class Bench:
         planner: what is tested; its system is the robot.
         cases: start, goal, and what else E holds.
         evaluation: how.
+        demonstrations: what the controller `cloned` is regressed on; else None.
     """
 
     planner: Planner
     cases: Cases
     evaluation: ClosedLoop
+    demonstrations: Demonstrations | None = None
 
     @property
     def task(self) -> Steering:
@@ -111,8 +113,10 @@ class Bench:
                       delay=self.evaluation.delay)  # fmt: skip
         return episode, float(np.mean(controller.seconds)) / (x_init.size // x_init.shape[-1])
 
-    def controller(self, kind: ControllerChoice, every: int) -> RecedingHorizon:
+    def controller(self, kind: ControllerChoice, every: int) -> RecedingHorizon | Cloned:
         """See `ClosedLoop.controllers`."""
+        if kind == "cloned":
+            return self._cloned()
         if kind in ("optimal", "modelled"):
             model = self.planner.system if kind == "optimal" else self.model
             return RecedingHorizon(partial(self._optimal_plan, model), every)
@@ -123,6 +127,22 @@ class Bench:
         layout, system = self.planner.layout, self.planner.system
         begin = layout.flatten(*start) if start is not None and self.evaluation.warm_start else None
         return layout.split(self.task.solve(system, self._from(x), model, begin))
+
+    def _cloned(self) -> Cloned:
+        shown = self.demonstrations
+        if shown is None:
+            raise ConfigError("evaluation: controller cloned needs demonstrations, and none are given")
+        goals = [
+            np.concatenate([E[..., where] for where in self._goal_channels], axis=-1)
+            for E in (shown.environment, self.cases.environment)
+        ]
+        return Cloned.of(self.planner.layout, shown.trajectories, *goals)
+
+    @property
+    def _goal_channels(self) -> list[slice]:
+        """Where E holds something else than the start."""
+        condition = self.planner.condition
+        return [condition.where(name) for name in condition.names if name != "x_init"]
 
     def _planned(self) -> PlanAnew:
         return PlanAnew(self.planner, self._from, self.evaluation.seed, warm=self.evaluation.warm_start)

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dadiff.behaviours import TrajectorySet, starts_fixed
+from dadiff.behaviours import TrajectorySet, Transitions, least_squares, starts_fixed
 from dadiff.datasets.cached import load_data, save_data
 from dadiff.denoisers.recipes import ExactRecipe, Recipe
+from dadiff.denoisers.training import InformedTraining
 from dadiff.diffusion.estimate import Estimate
 from dadiff.errors import ConfigError, NotApplicableError
 from dadiff.evaluation import ClosedLoop, Exact
@@ -289,8 +290,20 @@ class Experiment:
             folder,
             device=self.device,
             augment=task.augment if isinstance(task, Augmenting) and not self.encoder else None,
+            dynamics=self._shown_dynamics if isinstance(self.parts.training, InformedTraining) else None,
             progress=self.parts.settings.progress,
         )
+
+    @property
+    def _shown_dynamics(self) -> tuple[np.ndarray, np.ndarray]:
+        """G (nT, d) and g (nT,) of the linear dynamics that what is learned obeys on the whole, residuals in its units.
+
+        In the coordinates that the network learns in.
+        """
+        where, learned = self.coordinates, self._learned[1]
+        found = least_squares(Transitions.of(*self.layout.split(learned)), "estimated")
+        G, g = found.stages(self.layout.horizon).matrix(self.layout)
+        return G * where.scale, g if self.encoder else g - G @ where.mean
 
 
 def _of_robot(source: Any, robot: int) -> Any:

@@ -197,7 +197,8 @@ def _store(experiment: Experiment, plans: Plans, started: float) -> StoredRun:
         written |= tables(scores)
         metrics = headline(scores) | metrics | experiment.told_of_data | latency(experiment)
         if isinstance(experiment.parts.evaluation, ClosedLoop):
-            episodes = Bench(experiment.planner, experiment.cases, experiment.parts.evaluation).table()
+            shown = experiment.demonstrations if "cloned" in experiment.parts.evaluation.controllers else None
+            episodes = Bench(experiment.planner, experiment.cases, experiment.parts.evaluation, shown).table()
             written["closed_loop"] = episodes
             metrics |= means(episodes)
         if isinstance(experiment.parts.evaluation, Exact):
