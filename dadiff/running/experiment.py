@@ -23,6 +23,7 @@ from dadiff.diffusion.enforcement import PostHoc
 from dadiff.errors import NotApplicableError
 from dadiff.evaluation import ClosedLoop, Exact, planned_errors, replay, spread, tracking_errors, violations
 from dadiff.evaluation.closed_loop import Bench, latencies, means
+from dadiff.evaluation.likeness import likeness
 from dadiff.evaluation.mahalanobis import MahalanobisDistance
 from dadiff.evaluation.records import ChainRecorder, Snapshots, headline, merged, tables
 from dadiff.exact import Exactness, exactness, sampled_exactness
@@ -35,7 +36,7 @@ from dadiff.running.provenance import record_of
 from dadiff.store import StoredRun
 from dadiff.systems import Robots, System, TimeVarying, Unknown
 from dadiff.tasks import Scores
-from dadiff.tasks.task import Steering
+from dadiff.tasks.task import Lawful, Steering
 from dadiff.trajectory import TrajectoryLayout
 
 EXAMPLE_ROBOTS = 3
@@ -233,9 +234,19 @@ def evaluate(experiment: Experiment, planned: np.ndarray) -> Scores:
     return merged(
         tracking_errors(system, layout, cases, planned, rollout),
         spread(planned, experiment.covariance_trace),
+        experts_likeness(experiment, planned),
         violations(system, layout, planned, rollout),
         experiment.parts.task.score(system, cases, planned, rollout),
     )
+
+
+def experts_likeness(experiment: Experiment, planned: np.ndarray) -> Scores:
+    """Plans against fresh runs of the expert, where the law of these is known: it knows no bounds."""
+    task, system = experiment.parts.task, experiment.target
+    if not isinstance(task, Lawful) or system.bounds.any:
+        return Scores()
+    rng = numpy_generator(experiment.parts.evaluation.seed, "fresh runs of the expert")
+    return likeness(experiment.layout, planned, task.law(system), experiment.cases.environment, rng)
 
 
 def latency(experiment: Experiment) -> dict[str, float]:
