@@ -95,6 +95,8 @@ METRICS = {
     "spread": "spread of a case's plans, trace of the covariance",
     "spread_ratio": "spread / spread of the demonstrations' law",
     "state_spread_ratio": "spread of states / that of the expert's runs",
+    "rank": "median rank over cases",
+    "wins": "share of cases better than the baseline",
     "energy_distance": "energy distance to fresh runs of the expert",
     "coverage": "fresh runs of the expert within the plans' range, over its expectation",
     "exact_distance": "2-Wasserstein distance to the right law",

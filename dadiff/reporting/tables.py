@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import csv
 import io
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from dadiff.outside import spreadsheet_safe
 from dadiff.reporting.aggregation import LEVELS, Evidence, Method, has_metric, pair, varying
 from dadiff.reporting.labels import FLOORS, METRICS, method_name
+from dadiff.reporting.leaderboard import Place, places
 from dadiff.reporting.selection import Selector
 from dadiff.reporting.statistics import Estimate, difference, mean, ratio
 from dadiff.store.record import ABOUT_DATA, is_odd
@@ -62,6 +63,7 @@ def collect(
     metrics: list[str],
     relative_to: Selector | None = None,
     group: str | None = None,
+    ranked_by: str | None = None,
 ) -> Table:
     """The methods that `cells` asks for; metrics that none of them has are left out, those about data from files stand
     in every table.
@@ -70,13 +72,34 @@ def collect(
         metrics: `...` stands for all scores of the task that have no name in print, those of own tasks.
         relative_to: the baseline of ratios and differences.
         group: of a fleet, the robots of this group alone.
+        ranked_by: a metric, the less the better, by which methods have a `rank` and `wins`, and rows their order.
     """
     methods = evidence.methods(cells)
     metrics = [name for asked in metrics for name in (_own(methods) if asked == "..." else [asked])]
     wanted = dict.fromkeys([*metrics, *ABOUT_DATA])
     kept = [name for name in wanted if any(m.finished and has_metric(m.finished, name) for m in methods)]
     rows = [_row(evidence, method, kept, varying(methods), relative_to, group) for method in methods]
+    if ranked_by:
+        kept, rows = _ranked(evidence, methods, kept, rows, ranked_by, relative_to)
     return Table(kept, method_name(dict(relative_to)) if relative_to else "", rows, _odd(methods))
+
+
+def _ranked(
+    evidence: Evidence, methods: list[Method], metrics: list[str], rows: list[Row], by: str, baseline: Selector | None
+) -> tuple[list[str], list[Row]]:
+    """The metrics with `rank` and `wins` before them, and the rows from the first place to the last."""
+    others = [evidence.partner(method, baseline) for method in methods if method.finished] if baseline else []
+    other = next((found for found in others if found is not None), None)
+    found = [
+        (place.rank.value if place else float("inf"), replace(row, values=row.values | _place(place)))
+        for place, row in zip(places(methods, by, other), rows, strict=True)
+    ]
+    return ["rank", "wins", *metrics], [row for _, row in sorted(found, key=lambda pair: pair[0])]
+
+
+def _place(place: Place | None) -> dict[str, Value | None]:
+    shown = {"rank": place.rank, "wins": place.wins} if place else dict.fromkeys(("rank", "wins"))
+    return {name: None if estimate is None else Value(estimate, None, None) for name, estimate in shown.items()}
 
 
 def _odd(methods: list[Method]) -> list[str]:
