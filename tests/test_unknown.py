@@ -11,11 +11,13 @@ import pytest
 from test_physics import SYSTEM, run
 
 import dadiff
+from dadiff.datasets.own import OwnEnvironments
 from dadiff.errors import DadiffError, NotApplicableError
 from dadiff.planning import Planner
 from dadiff.running.data import outside
-from dadiff.systems import require_affine, unknown
+from dadiff.systems import double_integrator, require_affine, unknown
 from dadiff.tasks import LQR
+from dadiff.tasks.obstacles import Obstacles
 from dadiff.trajectory import Channel, Layout
 
 NEEDS_THE_SYSTEM = ("rollout_state_error", "gap", "dynamics_residual", "cost_ratio", "prediction_error",
@@ -104,6 +106,18 @@ def test_a_recording_of_another_robot_than_the_demonstrations_is_refused(folders
     done = planned(folders, *words, "dataset.allow_mismatch=true")
     assert done.metrics["demonstrations_residual"] > 5
     assert "demonstrations / noise" in str(dadiff.running.summary.one_run(done))
+
+
+def test_environments_in_centimetres_are_said_by_their_target(tmp_path, caplog):
+    (tmp_path / "cm.yaml").write_text(
+        "- {x_init: [0, 0, 0, 0], target: [300, 100], obstacles: [{centre: [150, 50], radius: 40}]}"
+    )
+    task, robot = Obstacles(), double_integrator(process_noise=0.0)
+    own = OwnEnvironments(str(tmp_path / "cm.yaml"), train_size=60)
+    learned, asked = own.train(task, robot).environment, own.test(task, robot).environment
+    assert outside(task.condition(robot), learned, asked) == 1
+    assert re.search(r"of (target|obstacles|waypoints), case 0 has (300|150|1e|40).* other units", caplog.text)
+    assert outside(task.condition(robot), learned, own.generated.test(task, robot).environment) == 0
 
 
 def test_it_has_no_step_and_no_matrices():

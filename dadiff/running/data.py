@@ -62,7 +62,8 @@ def outside(condition: Layout, learned: np.ndarray, asked: np.ndarray) -> int:
     beyond = np.maximum(low - margin - asked, asked - high - margin)
     far = (beyond > 0).any(axis=-1)
     if far.any():
-        case, entry = np.unravel_index(int((beyond / np.maximum(high - low, 1e-12)).argmax()), beyond.shape)
+        size = np.maximum(high - low, np.maximum(np.abs(low), np.abs(high)))
+        case, entry = np.unravel_index(int((beyond / np.maximum(size, 1e-12)).argmax()), beyond.shape)
         log.warning(
             "dataset: %d of %d test conditions lie far outside of what was learned from; of %s, case %d has %.4g where "
             "training had %.4g to %.4g: other units? what is planned there is a guess",
