@@ -6,10 +6,13 @@ import json
 import logging
 import os
 import shutil
+import socket
 import sqlite3
 import subprocess
 import sys
+import threading
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +23,7 @@ from dadiff.errors import ConfigError, StoreError
 from dadiff.store import Cache, Provenance, Record, Results, Sweep, Sweeps, SweptRun, store_id
 from dadiff.sync import main as dadiff_sync
 from dadiff.sync import sync
-from dadiff.tracking import Tracking
+from dadiff.tracking import Tracking, client
 from dadiff.tracking.client import open_client
 
 KEY = "0123456789abcdef"
@@ -74,6 +77,42 @@ def test_a_run_is_mirrored_with_curves_scalars_and_tables(tracking, tmp_path):
     assert "2 cases" in mirror.data.tags["mlflow.note.content"]
     files = {artifact.path for artifact in client.list_artifacts(mirror.info.run_id)}
     assert files == {"run.json", "config.yaml", "per_step.parquet"}
+
+
+def drip(connection) -> None:
+    for byte in b"HTTP/1.1 200 OK\r\nContent-Length: 100000\r\n\r\n" + b"x" * 1000:
+        connection.sendall(bytes([byte]))
+        time.sleep(0.1)
+
+
+SERVERS = {
+    "drips": drip,
+    "is silent": lambda connection: time.sleep(30),
+    "speaks something else": lambda connection: connection.sendall(b"SSH-2.0-OpenSSH\r\n"),
+    "hangs up": lambda connection: None,
+}
+
+
+@pytest.mark.parametrize("kind", SERVERS)
+def test_a_server_that_keeps_one_waiting_is_told_in_a_line_in_time(kind, monkeypatch):
+    monkeypatch.setattr(client, "PROBE_SECONDS", 0.5)
+    listening = socket.create_server(("127.0.0.1", 0))
+
+    def serve() -> None:
+        with suppress(OSError):
+            while True:
+                connection, _ = listening.accept()
+                with connection, suppress(OSError):
+                    connection.recv(4096)
+                    SERVERS[kind](connection)
+
+    threading.Thread(target=serve, daemon=True).start()
+    start = time.monotonic()
+    with pytest.raises(StoreError, match=r"the MLflow server http://127\.0\.0\.1:\d+ does not answer") as told:
+        client.prepare_store(f"http://127.0.0.1:{listening.getsockname()[1]}", "x", None)
+    assert "\n" not in str(told.value)
+    assert time.monotonic() - start < 5
+    listening.close()
 
 
 @pytest.mark.parametrize("name", ["a%20b", "50 % off?#1", "q'uote\"d"])

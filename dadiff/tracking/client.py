@@ -7,10 +7,12 @@ import logging
 import os
 import sqlite3
 import tempfile
+import threading
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
+from http.client import HTTPException
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -31,7 +33,9 @@ SETTINGS = {
     "MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR": "false",
 }
 EXPERIMENT_TAGS = {"mlflow.experimentKind": "custom_model_development"}  # the pages for training, not for chats
-PROBE_SECONDS = 5
+PROBE_SECONDS, MOST_READ = 4, 2**20
+MISSING = ("it answered 400", "it answered 404")
+"""What the interface says of an experiment that is not there yet."""
 
 log = logging.getLogger(__name__)
 
@@ -77,22 +81,41 @@ def _experiment_id(client: MlflowClient, name: str, artifacts: str | None) -> st
 
 
 def _probe(uri: str) -> None:
-    """Ask the server for its health.
+    """Ask the server for its health, and whether its interface answers.
 
     Raises:
-        StoreError: if it does not answer within seconds.
+        StoreError: if it does not answer within seconds, however it keeps one waiting.
     """
-    try:
-        with urllib.request.urlopen(f"{uri.rstrip('/')}/health", timeout=PROBE_SECONDS):
-            return
-    except urllib.error.HTTPError as error:
-        answer = f"it answered {error.code}"
-    except OSError as error:
-        answer = str(getattr(error, "reason", error))
-    raise StoreError(
-        f"tracking: the MLflow server {without_passwords(uri)} does not answer ({answer}); "
-        "start it, mend tracking.uri, or take tracking=sqlite"
-    )
+    for page in ("health", "api/2.0/mlflow/experiments/get-by-name?experiment_name=dadiff"):
+        answer = _answer(f"{uri.rstrip('/')}/{page}")
+        if answer and not (page.startswith("api") and answer in MISSING):
+            raise StoreError(
+                f"tracking: the MLflow server {without_passwords(uri)} does not answer ({answer}); "
+                "start it, mend tracking.uri, or take tracking=sqlite"
+            )
+
+
+def _answer(url: str) -> str:
+    """What went wrong as a page was asked for; empty if it came whole within PROBE_SECONDS.
+
+    In a thread of its own, since the time-outs of sockets begin anew with every byte.
+    """
+    found: list[str] = []
+
+    def ask() -> None:
+        try:
+            with urllib.request.urlopen(url, timeout=PROBE_SECONDS) as reply:
+                reply.read(MOST_READ)
+            found.append("")
+        except urllib.error.HTTPError as error:
+            found.append(f"it answered {error.code}")
+        except (OSError, HTTPException, ValueError) as error:
+            found.append(" ".join(str(getattr(error, "reason", error)).split()) or type(error).__name__)
+
+    asked = threading.Thread(target=ask, daemon=True)
+    asked.start()
+    asked.join(PROBE_SECONDS)
+    return found[0] if found else f"nothing whole within {PROBE_SECONDS} s"
 
 
 def _lock_file(uri: str) -> Path:
