@@ -27,7 +27,10 @@ from dadiff.reporting.statistics import Draws
 
 PRESETS = ("_fixed", "_unchecked")  # what they set is an axis of its own
 ALIASES = ("projector.initial_state",)  # stored as `initial_state`, too
-FIRST = ("task", "projector", "enforcement", "initial_state", "recording.length", "system.process_noise", "denoiser")
+FIRST = (
+    *("task", "projector", "projector.features", "enforcement", "initial_state", "recording.length"),
+    *("system.process_noise", "denoiser"),
+)
 LEVELS = ("robot", "case", "sample", "t")
 
 DRAWN = {"seed": "seed", "training.seed": "training seed", "recording.seed": "recording", "dataset.seed": "data set",

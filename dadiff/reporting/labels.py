@@ -43,6 +43,12 @@ WORDS: dict[str, dict[str, str]] = {
     "initial_state": {"fixed": "x(0) fixed", "free": "x(0) free"},
     "sampler.last_step_noise": {"True": "with last-step noise", "False": "without last-step noise"},
     "denoiser": {"gaussian": "exact denoiser"},
+    "task": {"manoeuvre_pendulums": "pendulums", "manoeuvre_reachers": "reachers"},
+    "projector.features": {
+        "[]": "",
+        "['trigonometric']": "sin, cos",
+        "['constant', 'identity', 'trigonometric', 'control_affine']": "sin, cos times u",
+    },
     "enforcement.metric": {
         "estimate": "metric of the estimate",
         "diagonal": "diagonal metric",
@@ -50,7 +56,7 @@ WORDS: dict[str, dict[str, str]] = {
         "physical": "physical metric",
     },
 }
-CHOICES = (*WORDS, "task", "sampler", "schedule", "training", "system")
+CHOICES = (*WORDS, "sampler", "schedule", "training", "system")
 SYMBOLS = {
     "recording.length": "S",
     "task.robots": "robots in training",
