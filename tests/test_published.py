@@ -51,6 +51,8 @@ def fresh(tmp_path_factory) -> Path:
 def test_publishing_writes_the_page_and_the_index(fresh):
     page = (fresh / "README.md").read_text()
     assert page.startswith("# LQR with and without dynamics in the denoising\n")
+    assert "output_dir=" not in page
+    assert "--output-dir" not in page
     assert "![State and control error along the horizon](figures/errors.svg)" in page
     assert "lqr_made_up" in (fresh.parent / "README.md").read_text()
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,10 @@ from dadiff.reporting.tables import to_csv
 from dadiff.store.files import make_folder, strict
 
 PUBLISHED = ("report.json", "configurations.yaml", "tables/*.csv", "figures/*.svg")
+
+
+PLACE = re.compile(r" (?:[+]*output_dir=|--output-dir )\S+| progress=\w+")
+"""Of a command, where its results lay and whether it showed its progress: a reader types it without."""
 
 
 def render(report: Report, folder: Path) -> Path:
@@ -67,6 +72,9 @@ def publish(report: Path, folder: Path) -> None:
             target = folder / path.relative_to(report)
             make_folder(target.parent)
             shutil.copyfile(path, target)
+    content = json.loads((folder / "report.json").read_text("utf-8"))
+    content["commands"] = [PLACE.sub("", command) for command in content["commands"]]
+    (folder / "report.json").write_text(slim.numbers(content), "utf-8")
     _remove(folder, older - _parts_in(folder))
     if folder.absolute().parent.name == "published":
         publishing.write_pages(folder.absolute().parent)
