@@ -122,11 +122,14 @@ def test_hydra_is_asked_to_do_nothing_but_compose(override):
         ("dry_run", "is no override; write group=choice or group.key=value"),
         ("sampler=[", "cannot be read as key=value"),
         ("seed=${nowhere}", "nowhere"),
+        ("seed=1,2", "seed=1,2 may be a sweep or a list; write -m to sweep over it, or 'seed=[1,2]'"),
+        ("training.steps=1,2", "training.steps=1,2 may be a sweep or a list"),
+        ("+sweeps=lqr_quick training.steps=1,2 projectr=known", "key 'projectr' is not known; did you mean projector?"),
     ],
 )
 def test_mistakes_that_hydra_finds_are_told_in_one_line(mistake, told):
     with pytest.raises(ConfigError) as caught:
-        composed(mistake)
+        composed(*mistake.split(" "))
     assert told in str(caught.value)
     assert "\n" not in str(caught.value)
 

@@ -63,6 +63,9 @@ PARAMETER = re.compile(rf"({'|'.join(GROUPS)})\.[\w.]+=")
 """A component's parameter, which its preset may leave to its default; which ones there are, its signature says."""
 
 
+AMBIGUOUS = re.compile(r"Ambiguous value for argument '\+*([^=']+)=([^']*)'")
+
+
 class GuardedLoader(ConfigLoaderImpl):
     """Hydra's loader, which refuses what must not come from a file."""
 
@@ -84,18 +87,31 @@ class GuardedLoader(ConfigLoaderImpl):
         try:
             config = super().load_configuration(config_name, given, *arguments)
         except MALFORMED as error:
-            raise ConfigError(self._told(error, config_name)) from error
+            raise ConfigError(self._told(self._cause(error, config_name, given), config_name)) from error
         if "output_dir" in config:
             check(config)
             if run_mode == RunMode.MULTIRUN and validate_sweep_overrides:  # else Hydra only asks for its mode
                 check_sweep(config, overrides)
         return config
 
+    def _cause(self, error: Exception, config_name: str | None, overrides: list[str]) -> Exception:
+        """What is wrong where Hydra, having found no mode in a file that is wrong, complains of a sweep's commas."""
+        if "Ambiguous value" not in str(error):
+            return error
+        try:
+            super().load_configuration(config_name, overrides, RunMode.MULTIRUN, validate_sweep_overrides=False)
+        except MALFORMED as cause:
+            return cause
+        return error
+
     def _told(self, error: Exception, config_name: str | None) -> str:
         """Hydra's complaint in one line, with what was probably meant."""
         if isinstance(error, OverrideParseException):
             return _unreadable(error)
         text = one_line(error)
+        if found := AMBIGUOUS.match(text):
+            key, values = found.groups()
+            return f"{key}={values} may be a sweep or a list; write -m to sweep over it, or '{key}=[{values}]'"
         if isinstance(error, MissingConfigException) and error.options:
             return f"{text.partition('Available options')[0].strip()}; {_meant(_last(error), error.options)}"
         if (found := text.partition("Could not override '")[2]) and config_name:
