@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import ClassVar, Generic, Protocol, TypeVar, runtime_checkable
 
@@ -116,7 +117,7 @@ class Sources:
         return value
 
 
-class Fitted(Generic[Found]):
+class Fitted(ABC, Generic[Found]):
     """A projector that says how it finds its set from its sources.
 
     Attributes:
@@ -135,9 +136,9 @@ class Fitted(Generic[Found]):
         """See `Projector.fit`."""
         return self.find(layout, Sources(self.label, system, recording, demonstrations))
 
+    @abstractmethod
     def find(self, layout: TrajectoryLayout, sources: Sources) -> Found:
         """The set."""
-        raise NotImplementedError
 
 
 def told(sources: frozenset[str], offset: Offset) -> frozenset[str]:
