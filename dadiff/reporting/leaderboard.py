@@ -47,8 +47,8 @@ def places(methods: list[Method], metric: str, baseline: Method | None) -> list[
     ranks = rankdata(values, axis=0)
     against = None if baseline is None else _by_case(baseline, metric)
     for row, k in enumerate(kept):
-        compared = against is not None and against.size == most and methods[k] is not baseline
-        standing[k] = Place(median(ranks[row]), wins(values[row], against) if compared else None)
+        compared = None if methods[k] is baseline or against is None or against.size != most else against
+        standing[k] = Place(median(ranks[row]), None if compared is None else wins(values[row], compared))
     return standing
 
 
