@@ -151,5 +151,5 @@ def test_a_family_whose_offsets_differ_has_no_known_one():
     plant = affine(PLANTS["fleet"])
     with pytest.raises(ConfigError, match=r"offsets differ.*use projector\.offset=estimated"):
         IdentifiedFamily(offset="known").fit(plant.layout(HORIZON), plant, *data(plant, 0.0))
-    with pytest.raises(ConfigError, match="needs a system, whose offset is known"):
+    with pytest.raises(ConfigError, match="needs a system, and none is given"):
         IdentifiedFamily(offset="known").fit(plant.layout(HORIZON), None, *data(plant, 0.0))

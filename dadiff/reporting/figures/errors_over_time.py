@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from dadiff.reporting.aggregation import Evidence, Method, varying
+from dadiff.reporting.aggregation import Evidence, Method, has_metric, varying
 from dadiff.reporting.figures.style import (
     at_the_edge,
     drawn,
@@ -119,14 +119,14 @@ def collect(
     values = list(dict.fromkeys(method.axes.get(by) for method in alive)) if by else [None]
 
     def panel(metric: str, value: Any) -> Panel:
-        here = [method for method in alive if by is None or method.axes.get(by) == value]
+        here = [m for m in alive if (by is None or m.axes.get(by) == value) and has_metric(m.finished, metric)]
         condition = axis_value(by, value) if by and len(values) > 1 else ""
         curves = [_curve(method, metric, [name for name in shown if name != by]) for method in here]
         return Panel(metric, condition, _merged(curves))
 
-    panels = [panel(metric, value) for value in values for metric in metrics]
+    panels = [made for value in values for metric in metrics if (made := panel(metric, value)).curves]
     notes = [f"{method_name(method.axes, shown)}: {method.outcome}" for method in methods if method.lost]
-    return ErrorsOverTime(panels if alive else [], marked or [], [key for m in alive for key in m.keys], notes)
+    return ErrorsOverTime(panels, marked or [], [key for m in alive for key in m.keys] if panels else [], notes)
 
 
 def _merged(curves: list[Curve]) -> list[Curve]:
