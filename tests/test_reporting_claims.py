@@ -17,6 +17,7 @@ from dadiff.reporting.definitions import FOLDER, load, names
 from dadiff.reporting.report import build
 from dadiff.reporting.sources import read_sweeps
 from dadiff.reporting.statistics import Estimate
+from dadiff.reporting.story import sentences
 
 LEDGER = {claim.id: claim for claim in read_ledger(FOLDER / "claims.yaml")}
 TRUTHS = ("holds", "does not hold", "undecided")
@@ -342,3 +343,13 @@ def test_the_ledger_names_what_is_wrong(tmp_path):
 def test_reports_ask_for_claims_that_exist():
     for name in names():
         assert set(load(name).claims or []) <= set(LEDGER)
+
+
+def test_a_table_without_a_baseline_says_who_has_least_and_who_has_most():
+    def row(label: str, value: float) -> dict[str, object]:
+        return {"label": label, "values": {"exact_distance": {"mean": Estimate(value, value, value), "ratio": None}}}
+
+    rows = [row("a", 2.0), row("b", 1e-12), row("c", 3.5), {"label": "d", "values": {"exact_distance": None}}]
+    table = {"runs": ["k"], "content": {"baseline": "", "metrics": ["rank", "exact_distance"], "rows": rows}}
+    told = "Of 3 methods the lowest distance to the right law is that of b, exact; the highest that of c, 3.50."
+    assert sentences({"tables": {"t": table}}, []) == [told]

@@ -25,7 +25,7 @@ PROJECTORS = {
     "rollout": "roll-out",
 }
 ENFORCEMENTS = {
-    "none": "none",
+    "none": "not enforced",
     "post_hoc": "once at the end",
     "post_hoc_repeated": "at the end",
     "normalised": "every step",
@@ -105,8 +105,8 @@ METRICS = {
     "wins": "share of cases better than the baseline",
     "energy_distance": "energy distance to fresh runs of the expert",
     "coverage": "fresh runs of the expert within the plans' range, over its expectation",
-    "exact_distance": "2-Wasserstein distance to the right law",
-    "exact_mean_distance": "distance of the mean from the right law's",
+    "exact_distance": "distance to the right law",
+    "exact_mean_distance": "distance of the means",
     "exact_spread": "spread / spread of the right law",
     "plan_latency": "time of one plan [s]",
     "success": "share of success after replay",
@@ -130,6 +130,12 @@ METRICS = {
 }
 ROUNDING = 1e-18
 """Below this a squared error is that of the arithmetic."""
+
+
+def rounding(metric: str) -> float:
+    """Below this a metric is that of the arithmetic: of squares `ROUNDING`, of distances its root."""
+    return math.sqrt(ROUNDING) if metric.endswith("_distance") else ROUNDING
+
 
 FLOORS = {"cost_ratio": 1.0, "median_cost_ratio": 1.0}
 """What metrics cannot go below, where it is not 0: a cost over the optimal cost."""
@@ -161,7 +167,7 @@ def column_value(metric: str, value: float, low: float, high: float) -> str:
         ('0.250 [0.125, 0.500]', 'exact')
     """
     floor = FLOORS.get(metric, 0.0)
-    if metric.endswith(("_error", "gap", "_residual")) and value < ROUNDING:
+    if metric.endswith(("_error", "gap", "_residual", "_distance")) and value < rounding(metric):
         return "exact"
     return with_interval(value - floor, low - floor, high - floor)
 

@@ -7,11 +7,11 @@ places say different things.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from typing import Any
 
 from dadiff.reporting.claims import Claim, Finding, conclude, decide
-from dadiff.reporting.labels import axis_value, column_name, metric_name, number, with_interval
+from dadiff.reporting.labels import axis_value, column_name, column_value, metric_name, number, with_interval
 from dadiff.reporting.measures import IDENTITY
 from dadiff.reporting.statistics import Estimate
 
@@ -153,10 +153,12 @@ def sentences(content: Mapping[str, Any], lines: list[Line]) -> list[str]:
 def _compared(content: Mapping[str, Any]) -> list[str]:
     """Of the first metric of the main table."""
     found = main_table(content)
-    if found is None or not found[1]["content"]["baseline"]:
+    if found is None:
         return []
     table = found[1]["content"]
-    metric, baseline = table["metrics"][0], table["baseline"]
+    metric, baseline = next(name for name in table["metrics"] if name not in PLACES), table["baseline"]
+    if not baseline:
+        return _extremes(table, metric)
     rows = [(row["label"], ratio_of(row, metric)) for row in table["rows"]]
     compared = [(label, ratio) for label, ratio in rows if ratio and label.split(",")[0] != baseline]
     if not compared:
@@ -165,6 +167,21 @@ def _compared(content: Mapping[str, Any]) -> list[str]:
     better = sorted((found for found in compared if found[1].high < 1), key=lambda found: found[1].value)
     worse = sorted((found for found in compared if found[1].low > 1), key=lambda found: -found[1].value)
     return [_better(name, baseline, better, len(compared)), _worse(name, worse, table["rows"])]
+
+
+def _extremes(table: Mapping[str, Any], metric: str) -> list[str]:
+    """Of a table without a baseline: who has least and who has most of a metric."""
+    means = {row["label"]: found for row in table["rows"] if (found := ratio_of(row, metric, "mean"))}
+    if len(means) < 2:
+        return []
+    least, most = (choose(means, key=lambda label: means[label].value) for choose in (min, max))
+    told = [f"{label}, {column_value(metric, *astuple(means[label]))}" for label in (least, most)]
+    name = column_name(metric).split(" ‖")[0]
+    return [f"Of {len(means)} methods the lowest {name} is that of {told[0]}; the highest that of {told[1]}."]
+
+
+PLACES = ("rank", "wins")
+"""Columns of a ranked table that are no metric of a run."""
 
 
 def main_table(content: Mapping[str, Any]) -> tuple[str, Mapping[str, Any]] | None:

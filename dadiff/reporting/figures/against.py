@@ -28,7 +28,7 @@ from dadiff.reporting.figures.style import (
     panels,
     tag,
 )
-from dadiff.reporting.labels import FLOORS, ROUNDING, axis_name, axis_value, method_name, metric_name
+from dadiff.reporting.labels import FLOORS, axis_name, axis_value, method_name, metric_name, rounding
 from dadiff.reporting.selection import Selector
 from dadiff.reporting.statistics import Estimate, mean, ratio
 
@@ -79,7 +79,7 @@ class Against:
             self._mark(ax)
             ax.set_xlabel(axis_name(self.axis))
             ax.set_ylabel(f"relative to {self.relative}" if self.relative else "")
-            ax.set_title(", ".join(filter(None, (metric_name(panel.metric), panel.title))), wrap=True)
+            ax.set_title("\n".join(filter(None, (metric_name(panel.metric), panel.title))))
         letter(axes)
         legend_below(figure, axes)
         return figure
@@ -94,16 +94,16 @@ class Against:
 def _draw_panel(ax: Axes, panel: Panel, *, labelled: bool) -> None:
     for line, look in zip(panel.lines, looks_of([line.axes for line in panel.lines]), strict=True):
         exact = np.array([e.value for e in line.y])
-        y = drawn(exact)
+        y = drawn(exact, rounding(panel.metric))
         bars = [[e.value - e.low for e in line.y], [e.high - e.value for e in line.y]]
         whiskers = ax.errorbar(line.x, y, bars, fmt="none", color=look.colour, capsize=2, lw=1)
         (drawn_line,) = ax.plot(line.x, y, ls=look.line, lw=1.4, label=line.label, **look.points)
         tag(line.label, drawn_line, values=True)
         tag(line.label, *whiskers.get_children())
-        at_the_edge(ax, np.array(line.x), exact, look, line.label)
+        at_the_edge(ax, np.array(line.x), exact, look, line.label, rounding(panel.metric))
     for line in panel.levels:
         look, estimate = look_of(line.axes), line.y[0]
-        if estimate.value <= ROUNDING:
+        if estimate.value <= rounding(panel.metric):
             continue
         level = ax.axhline(estimate.value, color=look.colour, ls=(0, (2, 2)), lw=1.2, label=line.label)
         tag(line.label, level, ax.axhspan(estimate.low, estimate.high, color=look.colour, alpha=0.12, lw=0))
@@ -119,7 +119,7 @@ def _ends(panel: Panel) -> list[tuple[Line, Look, float]]:
     """The lines with their looks and the values where they end; those at rounding have no place on the axis."""
     looks = looks_of([line.axes for line in panel.lines])
     ends = [(line, look, line.y[-1].value) for line, look in zip(panel.lines, looks, strict=True) if line.y]
-    return [end for end in ends if end[2] > ROUNDING]
+    return [end for end in ends if end[2] > rounding(panel.metric)]
 
 
 def collect(

@@ -78,7 +78,7 @@ class Boundary:
         ax.set_xlabel(axis_name(self.names[1]))
         ax.tick_params(length=0)
         ax.spines[:].set_visible(False)
-        ax.set_title(f"{panel.label}: {metric_name(self.metric).split(' ‖')[0]} × {self.baseline}", wrap=True)
+        ax.set_title(f"{panel.label}\n{metric_name(self.metric).split(' ‖')[0]} × {self.baseline}")
 
 
 def _count(panel: Panel) -> int:

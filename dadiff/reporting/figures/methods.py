@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from dadiff.reporting.aggregation import Evidence, Method, has_metric, varying
 from dadiff.reporting.figures.style import INK, drawn, headline, letter, log_axis, look_of, panels
-from dadiff.reporting.labels import FLOORS, PROJECTORS, ROUNDING, column_name, method_name, metric_name, number
+from dadiff.reporting.labels import FLOORS, PROJECTORS, column_name, method_name, metric_name, number, rounding
 from dadiff.reporting.selection import Selector
 from dadiff.reporting.statistics import Estimate, mean
 
@@ -54,7 +54,7 @@ class Methods:
         """One panel a metric."""
         figure, axes = panels(len(self.metrics), columns, width=4.1, height=0.9 + 0.32 * len(self.rows[0]))
         for index, (ax, metric, rows) in enumerate(zip(axes, self.metrics, self.rows, strict=True)):
-            _draw_rows(ax, rows, log=self.log)
+            _draw_rows(ax, rows, log=self.log, below=rounding(metric))
             ax.set_title(column_name(metric) if self.above else metric_name(metric))
             ax.tick_params(labelleft=index % columns == 0)
             if self.above:
@@ -80,7 +80,7 @@ class Methods:
         return f"Lowest {name}: {number(means[best], 2)} with {best}; vanilla: {beside}"
 
 
-def _draw_rows(ax: Axes, rows: list[Row], *, log: bool) -> None:
+def _draw_rows(ax: Axes, rows: list[Row], *, log: bool, below: float) -> None:
     many = sum(len(row.dots) for row in rows) > MANY_DOTS
     for y, row in enumerate(rows):
         look = look_of(row.axes)
@@ -95,9 +95,9 @@ def _draw_rows(ax: Axes, rows: list[Row], *, log: bool) -> None:
             )
             continue
         offsets = y + 0.32 * (np.arange(len(row.dots)) / max(1, len(row.dots) - 1) - 0.5)
-        shown = drawn(row.dots) if log else row.dots
+        shown = drawn(row.dots, below) if log else row.dots
         ax.plot(shown, offsets, ".", color=look.colour, alpha=0.6, ms=5.5, mew=0, rasterized=many)
-        if log and row.estimate.value <= ROUNDING:
+        if log and row.estimate.value <= below:
             ax.annotate("exact", (0.02, y), xycoords=("axes fraction", "data"), va="center", fontsize=7.5)
             continue
         bars = [[row.estimate.value - row.estimate.low], [row.estimate.high - row.estimate.value]]

@@ -139,15 +139,15 @@ def tag(label: str, *artists: Artist, values: bool = False) -> None:
 TAG = "method:"
 
 
-def drawn(values: np.ndarray) -> np.ndarray:
-    """Values that a logarithmic axis can show; nan where they are 0, rounding or undefined."""
-    shown: np.ndarray = np.where(np.nan_to_num(values) > ROUNDING, values, np.nan)
+def drawn(values: np.ndarray, below: float = ROUNDING) -> np.ndarray:
+    """Values that a logarithmic axis can show; nan where they are 0, rounding (`below`) or undefined."""
+    shown: np.ndarray = np.where(np.nan_to_num(values) > below, values, np.nan)
     return shown
 
 
-def at_the_edge(ax: Axes, x: np.ndarray, values: np.ndarray, look: Look, label: str) -> None:
-    """Values at rounding level as marks on the lower edge of an axis whose limits they leave alone."""
-    rounding = (values <= ROUNDING) & ~np.isnan(values)
+def at_the_edge(ax: Axes, x: np.ndarray, values: np.ndarray, look: Look, label: str, below: float = ROUNDING) -> None:
+    """Values at rounding level (`below`) as marks on the lower edge of an axis whose limits they leave alone."""
+    rounding = (values <= below) & ~np.isnan(values)
     if rounding.any():
         low = np.zeros(int(rounding.sum()))
         (marks,) = ax.plot(
