@@ -243,7 +243,9 @@ def test_runs_of_different_seeds_are_not_compared(tmp_path):
     store.run(0.2, seed=1, projector="known", enforcement="normalised")
     assert judged(store, LEDGER["fig2_state"]).verdict == "not tested here"
     for name in names():
-        build(load(name), Evidence(read_sweeps(store.folder, [store.name])), list(LEDGER.values()), "")
+        report = build(load(name), Evidence(read_sweeps(store.folder, [store.name])), list(LEDGER.values()), "")
+        for part in report.figures:
+            assert not part.runs or part.content.draw(2)
 
 
 def test_one_case_decides_nothing(tmp_path):

@@ -25,7 +25,7 @@ PROJECTORS = {
     "rollout": "roll-out",
 }
 ENFORCEMENTS = {
-    "none": "not enforced",
+    "none": "vanilla",
     "post_hoc": "once at the end",
     "post_hoc_repeated": "at the end",
     "normalised": "every step",
@@ -185,7 +185,7 @@ def method_name(axes: Mapping[str, Any], shown: Iterable[str] = ()) -> str:
         'Hankel HH†, S = 100'
     """
     projector = str(axes.get("projector", "?"))
-    words = [PROJECTORS.get(projector, projector)]
+    words = [] if shown and "projector" not in axes else [PROJECTORS.get(projector, projector)]
     for axis in shown:
         if axis in axes and axis != "projector" and axes[axis] is not None:
             words.append(axis_value(axis, axes[axis]))

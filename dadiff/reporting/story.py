@@ -160,13 +160,17 @@ def _compared(content: Mapping[str, Any]) -> list[str]:
     if not baseline:
         return _extremes(table, metric)
     rows = [(row["label"], ratio_of(row, metric)) for row in table["rows"]]
-    compared = [(label, ratio) for label, ratio in rows if ratio and label.split(",")[0] != baseline]
+    compared = [(label, ratio) for label, ratio in rows if ratio and label.split(",")[0] != baseline and ratio != SAME]
     if not compared:
         return []
     name = column_name(metric).split(" ‖")[0]
     better = sorted((found for found in compared if found[1].high < 1), key=lambda found: found[1].value)
     worse = sorted((found for found in compared if found[1].low > 1), key=lambda found: -found[1].value)
     return [_better(name, baseline, better, len(compared)), _worse(name, worse, table["rows"])]
+
+
+SAME = Estimate(1.0, 1.0, 1.0)
+"""What a baseline is to itself."""
 
 
 def _extremes(table: Mapping[str, Any], metric: str) -> list[str]:

@@ -81,7 +81,7 @@ def collect(
     rows = [_row(evidence, method, kept, varying(methods), relative_to, group) for method in methods]
     if ranked_by:
         kept, rows = _ranked(evidence, methods, kept, rows, ranked_by, relative_to)
-    return Table(kept, method_name(dict(relative_to)) if relative_to else "", rows, _odd(methods))
+    return Table(kept, method_name(dict(relative_to), relative_to) if relative_to else "", rows, _odd(methods))
 
 
 def _ranked(

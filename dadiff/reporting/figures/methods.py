@@ -154,13 +154,15 @@ def collect(
     robots = any("robots" in method.counts() for method in alive)
     notes = [f"{method_name(m.axes, shown)}: {m.outcome}" for m in methods if m.lost]
     return Methods(kept, rows, "robot" if robots else "case", log, above, best or {},
-                   [key for m in alive for key in m.keys], notes)  # fmt: skip
+                   [key for m in alive for key in m.keys] if kept else [], notes)  # fmt: skip
 
 
 def _row(method: Method, metric: str, shown: list[str], group: str | None, floor: float) -> Row:
     label = method_name(method.axes, shown)
     if not method.finished:
         return Row(label, method.axes, None, np.empty(0), method.outcome)
+    if not has_metric(method.finished, metric):
+        return Row(label, method.axes, None, np.empty(0), "not scored")
     draws = method.runs.scalars(metric, group)
     dots = np.nanmean(draws.values, axis=-1) if "robot" in draws.levels else draws.values
     found = mean(draws, FLOORS.get(metric, 0))
