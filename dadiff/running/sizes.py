@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 
 from dadiff.memory import check_fits
 from dadiff.systems import Family
+from dadiff.tasks.robots import ManyRobots
 
 if TYPE_CHECKING:
     from dadiff.running.parts import Parts
 
 DOUBLE = 8
 """Bytes."""
+
+
+@runtime_checkable
+class Sized(Protocol):
+    """A dataset that says how large it is; None stands for all that there is."""
+
+    train_size: int | None
+    test_size: int | None
 
 
 def check_sizes(parts: Parts) -> None:
@@ -29,9 +38,8 @@ def check_sizes(parts: Parts) -> None:
 def _numbers(parts: Parts) -> dict[str, float]:
     """How many floating-point numbers there are at least at one time, by what they follow from."""
     task, dataset, samples = parts.task, parts.dataset, parts.evaluation.samples
-    train, test = (getattr(dataset, name, None) or 1 for name in ("train_size", "test_size"))
-    trained = getattr(task, "robots", 1)
-    tested = getattr(task, "interpolation", 1) + getattr(task, "extrapolation", 0)
+    train, test = (dataset.train_size or 1, dataset.test_size or 1) if isinstance(dataset, Sized) else (1, 1)
+    trained, tested = (task.robots, task.interpolation + task.extrapolation) if isinstance(task, ManyRobots) else (1, 1)
     size = _trajectory_size(parts)
     horizon = f"task.horizon={task.horizon}"
     return {
