@@ -38,10 +38,10 @@ from faults import ROOT, Fault, faults
 
 COMPILED = "--compiled" in sys.argv
 ENOUGH = 0.95
-LONGEST, BUDGET = 15.0, 40.0  # processor seconds of a test that is used, and of all tests for one mutant
+LONGEST, BUDGET = 10.0, 20.0  # processor seconds of a test that is used, and of all tests for one mutant
 ROOMS = ("trajectory", "behaviours", "diffusion", "denoisers", "experts", "tasks")
 TESTS = """layout response hankel subspace covariance systems nonlinear features flat physics
-    behaviours bounded clear manifold family enforcement conditional rivals exact
+    behaviours limited limited_ilqr nearest limiting manifold family enforcement conditional rivals exact doubt
     samplers schedules silence theorem1 denoisers training encodings
     lqr fleet ilqr obstacle_solver obstacle_experts obstacle_files obstacle_task manoeuvre
     evaluation control closed_loop planning datasets"""
