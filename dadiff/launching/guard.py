@@ -109,8 +109,8 @@ class GuardedLoader(ConfigLoaderImpl):
         if isinstance(error, OverrideParseException):
             return _unreadable(error)
         text = one_line(error)
-        if found := AMBIGUOUS.match(text):
-            key, values = found.groups()
+        if several := AMBIGUOUS.match(text):
+            key, values = several.groups()
             return f"{key}={values} may be a sweep or a list; write -m to sweep over it, or '{key}=[{values}]'"
         if isinstance(error, MissingConfigException) and error.options:
             return f"{text.partition('Available options')[0].strip()}; {_meant(_last(error), error.options)}"
