@@ -78,7 +78,8 @@ class Experiment:
         if not isinstance(target, System):
             raise ConfigError(
                 "task: it plans for one system, and the chosen system is a family of robots; "
-                "use task=fleet, or a single system such as system=double_integrator"
+                "use task=fleet for linear robots, task=manoeuvre for nonlinear ones, or a single system such as "
+                "system=double_integrator"
             )
         if isinstance(target, Unknown) and isinstance(self.parts.evaluation, ClosedLoop | Exact):
             raise NotApplicableError(

@@ -197,5 +197,7 @@ class Manoeuvre(ManyRobots):
         """Raise `ConfigError` unless costs and ranges fit the states, and robots rest at a target."""
         for name in ("state_cost", "init_range"):
             if (found := len(getattr(self, name))) != robots.state_dim:
-                raise ConfigError(f"task: {name} has {found} entries, the system {robots.state_dim} states")
+                raise ConfigError(
+                    f"task: {name} has {found} entries, the system {robots.state_dim} states; give one for each state"
+                )
         at_rest(robots, np.broadcast_to(self.target_range, (*robots.robots, len(self.target_range))))
