@@ -121,6 +121,8 @@ class Echo:
         self.asked.append((tau, i, environment))
         return tau
 
+    estimate = __call__
+
 
 def test_a_network_is_asked_with_differences_and_answers_with_one(cases: Cases) -> None:
     encoder, schedule, echo = ENCODERS["path_frame"], cosine(100), Echo()
@@ -136,6 +138,9 @@ def test_a_network_is_asked_with_differences_and_answers_with_one(cases: Cases) 
     torch.testing.assert_close(told[:, 1], torch.tensor(features))
     denoise(tau, 29, E)
     assert echo.asked[1][2] is told, "encoded once for the same environments"
+    at = tau.clone().requires_grad_()
+    denoise.estimate(at, 30, E).sum().backward()
+    torch.testing.assert_close(at.grad, torch.ones_like(tau))
 
 
 SMALL = (

@@ -13,7 +13,8 @@ import torch
 import yaml
 from laws import composed
 
-from dadiff.errors import ConfigError, ExcitationError, StoreError
+from dadiff.errors import ConfigError, DadiffError, ExcitationError, StoreError
+from dadiff.launching import jobs
 from dadiff.running.assembly import Experiment
 from dadiff.running.experiment import execute
 from dadiff.store import StoredRun
@@ -215,3 +216,61 @@ def test_noise_prediction_is_refused_where_nothing_of_the_signal_is_left(tmp_pat
     with pytest.raises(ConfigError, match="prediction=noise divides by sqrt\\(alpha_bar_L\\)"):
         execute(Experiment.of(config))
     assert left_behind(tmp_path) == []
+
+
+TRAINED = ("denoiser=mlp", "denoiser.width=8", "denoiser.blocks=1", *(o for o in SMALL if o != "denoiser=gaussian"))
+BOUNDED = ("projector=known_bounded", "system.bounds={input_low: -2, input_high: 2}")
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["enforcement=qp_filter", "projector=known_fixed"], "it is about bounds, and this projector keeps to none"),
+        (["enforcement=barrier", "projector=known_fixed"], "it is about bounds, and this projector keeps to none"),
+        (["enforcement=constricting_tube", "projector=identified"], "it is about bounds"),
+        (["enforcement=literal", "projector=known_fixed"], "literal scales the sample"),
+        (["projector=hankel", "recording.length=20"], "record S >= 27"),
+        (["projector=known_bounded"], "bounds are to be enforced, and the system has none"),
+        (["projector=identified_soft", "projector.residual=each"], "too long to be held"),
+        (["evaluation=closed_loop", "task=obstacles", "task.horizon=40"], "needs a task that steers"),
+        (["projector=known", "evaluation=exact"], "the law of a trained denoiser is not known"),
+        (["projector=known", "denoiser=mlp_recording"], "holds no recording"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_planned_with_is_refused_before_anything_is_trained(monkeypatch, tmp_path, overrides, message):
+    def train(*_: object, **__: object) -> None:
+        pytest.fail("trained in vain")
+
+    monkeypatch.setattr("dadiff.denoisers.learning.train", train)
+    monkeypatch.setattr("dadiff.behaviours.doubt.DOUBTED_UP_TO", 20)
+    config = composed(*TRAINED, *overrides, f"output_dir={tmp_path}")
+    with pytest.raises(DadiffError) as single:
+        execute(Experiment.of(config))
+    with pytest.raises(DadiffError) as swept:
+        jobs.build([config], "denoiser")
+    assert message in str(single.value)
+    assert str(single.value) == str(swept.value)
+
+
+def test_bounds_that_are_enforced_and_gradients_that_are_there_are_not_refused(monkeypatch, tmp_path):
+    class Trained(Exception):
+        pass
+
+    def train(*_: object, **__: object) -> None:
+        raise Trained
+
+    monkeypatch.setattr("dadiff.denoisers.learning.train", train)
+    for overrides in (
+        (*BOUNDED, "enforcement=qp_filter"),
+        (*BOUNDED, "enforcement=barrier"),
+        ("projector=known_fixed", "enforcement=pigdm"),
+    ):
+        with pytest.raises(Trained):
+            execute(Experiment.of(composed(*TRAINED, *overrides, f"output_dir={tmp_path}")))
+
+
+def test_a_run_that_is_refused_leaves_what_it_shares_to_the_others(tmp_path):
+    small = (*TRAINED, "training.steps=2", "training.batch_size=8", "training.warmup=0", f"output_dir={tmp_path}")
+    refused, fine = (composed(*small, f"enforcement={e}", "projector=known_fixed") for e in ("qp_filter", "post_hoc"))
+    jobs.build([refused, fine], "denoiser")
+    assert len(list(tmp_path.glob("cache/denoiser/*/model.safetensors"))) == 1

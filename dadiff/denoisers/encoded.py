@@ -5,6 +5,7 @@ The chain, its coordinates and its projections see an ordinary denoiser of tau.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
@@ -72,8 +73,14 @@ class EncodedDenoiser:
         """tau0_hat (..., d) from tau (..., d), i in 1..L and E (..., c) in physical units."""
         if self._last is None or self._last.environment is not environment:  # a chain asks for the same one each step
             self._last = self._look(environment)
-        _, features, reference = self._last
-        return reference + self.network(tau - float(self.signal[i]) * reference, i, features)
+        return self._asked(self.network, tau, i, self._last)
+
+    def estimate(self, tau: Tensor, i: int, environment: Tensor) -> Tensor:
+        """The same, recorded by autograd."""
+        return self._asked(self.network.estimate, tau, i, self._look(environment))
+
+    def _asked(self, network: Callable[[Tensor, int, Tensor], Tensor], tau: Tensor, i: int, seen: _Seen) -> Tensor:
+        return seen.reference + network(tau - float(self.signal[i]) * seen.reference, i, seen.features)
 
     def _look(self, environment: Tensor) -> _Seen:
         features, reference = self.encoder.encode(environment.flatten(0, -2).cpu().numpy().astype(float))

@@ -18,11 +18,11 @@ import pandas as pd
 from dadiff.behaviours import model_of
 from dadiff.control import Cloned, Controller, Episode, OpenLoop, RecedingHorizon, Tracking, run
 from dadiff.control.controllers import Trajectories, tracking_gains
-from dadiff.errors import ConfigError, NotApplicableError
+from dadiff.errors import ConfigError
 from dadiff.evaluation.settings import ClosedLoop, ControllerChoice
 from dadiff.planning import Planner, Plans
 from dadiff.randomness import numpy_generator
-from dadiff.systems import System, TimeVarying
+from dadiff.systems import System
 from dadiff.tasks.task import Cases, Demonstrations, Steering
 
 TIMED_PLANS, TIMED_SECONDS = 100, 2.0  # plans of one case, one at a time, for the latency
@@ -46,17 +46,8 @@ class Bench:
 
     @property
     def task(self) -> Steering:
-        """Raises `ConfigError` unless it steers to a goal, and plans made later are made for the same dynamics."""
-        if not isinstance(self.planner.task, Steering):
-            raise ConfigError(
-                "evaluation: closed_loop needs a task that steers to a goal at quadratic cost; use task=lqr or "
-                "task=fleet, or evaluation=default"
-            )
-        if isinstance(self.planner.system, TimeVarying):
-            raise NotApplicableError(
-                "evaluation: closed_loop plans each time from t = 0, but the system varies; use evaluation=default"
-            )
-        return self.planner.task
+        """See `ClosedLoop.steered`."""
+        return self.evaluation.steered(self.planner.task, self.planner.system)
 
     @property
     def steps(self) -> int:

@@ -8,7 +8,9 @@ from typing import Literal
 
 import numpy as np
 
-from dadiff.errors import ConfigError
+from dadiff.errors import ConfigError, NotApplicableError
+from dadiff.systems import System, TimeVarying
+from dadiff.tasks.task import Steering, Task
 
 ControllerChoice = Literal["receding", "tracking", "optimal", "modelled", "cloned"]
 
@@ -78,6 +80,25 @@ class ClosedLoop(Evaluation):
                 f"evaluation: rate is {self.rate}, disturbance {self.disturbance}; need a positive number of plans a "
                 "second and a standard deviation of at least 0"
             )
+
+    @staticmethod
+    def steered(task: Task, system: System) -> Steering:
+        """The task, which must steer to a goal, where plans made later are made for the same dynamics.
+
+        Raises:
+            ConfigError: if it does not steer.
+            NotApplicableError: if the system varies.
+        """
+        if not isinstance(task, Steering):
+            raise ConfigError(
+                "evaluation: closed_loop needs a task that steers to a goal at quadratic cost; use task=lqr or "
+                "task=fleet, or evaluation=default"
+            )
+        if isinstance(system, TimeVarying):
+            raise NotApplicableError(
+                "evaluation: closed_loop plans each time from t = 0, but the system varies; use evaluation=default"
+            )
+        return task
 
 
 @dataclass(frozen=True, kw_only=True)

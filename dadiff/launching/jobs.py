@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from dadiff.errors import DadiffError
 from dadiff.launching.outcome import why
 from dadiff.running.identity import Identity, Shared, identity_of
 from dadiff.running.parts import Parts
@@ -59,11 +60,21 @@ def run_tracked(experiment: Experiment) -> StoredRun:
             tracking.log_run(experiment.results.read(identity.key))
 
 
-def build(config: Mapping[str, Any], kind: Shared) -> None:
-    """Build what runs of a configuration share, unless it is cached."""
+def build(configs: Sequence[Mapping[str, Any]], kind: Shared) -> None:
+    """Build what runs of these configurations share, unless it is cached; so that one that is refused harms no other.
+
+    Raises:
+        DadiffError: that of the first, if all of them are refused.
+    """
     from dadiff.running.assembly import Experiment
 
-    Experiment.of(config, anew=(kind,)).build(kind)
+    refusals: list[DadiffError] = []
+    for config in configs:
+        try:
+            return Experiment.of(config, anew=(kind,)).build(kind)
+        except DadiffError as refusal:
+            refusals.append(refusal)
+    raise refusals[0]
 
 
 def record_end(identity: Identity, config: Mapping[str, Any], status: Status, reason: str) -> None:

@@ -40,12 +40,12 @@ class Preparation:
     """Something that cells share and that is not in the cache yet.
 
     Args:
-        config: of a cell that needs it.
+        configs: of the cells that need it.
         needs: keys of the preparations that come before it.
     """
 
     artefact: Artefact
-    config: dict[str, Any]
+    configs: list[dict[str, Any]]
     needs: frozenset[str]
 
     @property
@@ -94,14 +94,15 @@ def _planned(config: dict[str, Any], identity: Identity, copies: int) -> Planned
 
 
 def _preparations(cells: Sequence[PlannedRun]) -> list[Preparation]:
-    """What trainings need, trainings, test cases; each once, with the configuration of the first cell that needs it."""
+    """What trainings need, trainings, test cases; each once, with the configurations of the cells that need it."""
     found: dict[str, Preparation] = {}
     for position in range(len(SHARED)):
         for cell in cells:
             artefact = _artefacts(cell.identity)[position]
             if artefact and (cell.config.get("force") or not _is_cached(cell, artefact)):
                 before = {cell.identity.demonstrations.key} if artefact.kind == "denoiser" else set()
-                found.setdefault(artefact.key, Preparation(artefact, cell.config, frozenset(found) & before))
+                found.setdefault(artefact.key, Preparation(artefact, [], frozenset(found) & before))
+                found[artefact.key].configs.append(cell.config)
     return list(found.values())
 
 

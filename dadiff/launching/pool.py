@@ -111,9 +111,15 @@ def _without_hopeless(waiting: Sequence[Work], outcomes: dict[str, Outcome], obs
     for work in waiting:
         failed = [key for key in sorted(work.needs) if key in outcomes and outcomes[key].status != "finished"]
         if failed:
-            reason = f"needs {failed[0]}, which failed: {outcomes[failed[0]].reason}"
-            outcomes[work.key] = Outcome("failed", reason, 0.0)
+            outcomes[work.key] = _given_up(failed[0], outcomes[failed[0]])
             observer.ended(work, outcomes[work.key])
         else:
             left.append(work)
     return left
+
+
+def _given_up(need: str, outcome: Outcome) -> Outcome:
+    """Of work whose need has failed; a need is refused only if all that share it are."""
+    if outcome.status == "refused":
+        return Outcome("refused", outcome.reason, 0.0)
+    return Outcome("failed", f"needs {need}, which failed: {outcome.reason}", 0.0)

@@ -134,7 +134,7 @@ class SweepRun:
     def _preparation(self, preparation: Preparation) -> Work:
         artefact = preparation.artefact
         log_file = self.folder / "logs" / f"{artefact.kind}-{artefact.key}.log"
-        arguments, alone = (preparation.config, artefact.kind), artefact.kind == "denoiser"
+        arguments, alone = (preparation.configs, artefact.kind), artefact.kind == "denoiser"
         return Work(artefact.key, preparation.name, jobs.build, arguments, log_file, preparation.needs, alone)
 
     def _run(self, cell: PlannedRun) -> Work:

@@ -198,6 +198,7 @@ class Planner:
         observe: Observe | None = None,
         start: np.ndarray | None = None,
         *,
+        signal: float = Start.signal,
         progress: bool = False,
     ) -> Samples:
         """The chain for conditions (*robots, plans, c), in the sampler's coordinates; see `dadiff.diffusion.chain`."""
@@ -214,8 +215,18 @@ class Planner:
             self.divergence_bound,
             progress,
             estimate=self.estimate,
-            start=None if start is None else Start(self._scaled(start)),
+            start=None if start is None else Start(self._scaled(start), signal),
         )
+
+    def rehearse(self, E: np.ndarray, tau: np.ndarray) -> None:
+        """Take the last step of a chain from trajectories (*robots, plans, d) for conditions (*robots, plans, c).
+
+        What keeps the parts from planning together shows here, also before the denoiser is trained.
+
+        Raises:
+            NotApplicableError: if the enforcement asks for what the set, the estimate or the denoiser has not.
+        """
+        self.draw(E, torch_generator(0, "rehearsal"), self.projection(E), start=tau, signal=1.0)
 
     def _scaled(self, tau: np.ndarray) -> torch.Tensor:
         return torch.as_tensor(self.coordinates.to_scaled(tau), device=self.device)

@@ -18,6 +18,7 @@ from dadiff.diffusion.estimate import Estimate
 from dadiff.errors import ConfigError, NotApplicableError
 from dadiff.evaluation import ClosedLoop, Exact
 from dadiff.experts.lqr import GaussianLaw
+from dadiff.randomness import torch_generator
 from dadiff.running.data import told_of_data
 from dadiff.running.identity import SHARED, Artefact, Identity, Shared, identity_of
 from dadiff.running.parts import Parts
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from dadiff.denoisers.encoded import EncodedDenoiser
     from dadiff.denoisers.learned import NetworkDenoiser
     from dadiff.planning import Planner
+    from dadiff.planning.planner import Denoiser
 
 
 @dataclass(frozen=True)
@@ -84,6 +86,13 @@ class Experiment:
         if isinstance(target, Unknown) and isinstance(self.parts.evaluation, ClosedLoop | Exact):
             raise NotApplicableError(
                 "evaluation: episodes and exact laws need the system, which is unknown; use evaluation=default"
+            )
+        if isinstance(self.parts.evaluation, ClosedLoop):
+            self.parts.evaluation.steered(self.parts.task, target)
+        if isinstance(self.parts.evaluation, Exact) and self.parts.denoiser.trainable:
+            raise NotApplicableError(
+                "evaluation: the law of a trained denoiser is not known; use denoiser=gaussian or "
+                "denoiser=moment_matched, or evaluation=default"
             )
         return target
 
@@ -183,25 +192,39 @@ class Experiment:
     @cached_property
     def planner(self) -> Planner:
         """All of it as one thing that plans."""
+        _ = self.behaviour, self.told_of_data  # before training: they may refuse what they are given
+        return self._planner(self.denoiser)
+
+    def _planner(self, denoiser: Denoiser) -> Planner:
         from dadiff.planning import Planner
 
-        behaviour, _ = self.behaviour, self.told_of_data  # before training: they may refuse what they are given
         return Planner(
             self.parts.task,
             self.target,
             self.parts.schedule,
             self.parts.sampler,
-            self.denoiser,
+            denoiser,
             self.coordinates,
-            behaviour,
+            self.behaviour,
             self.parts.enforcement,
             starts_fixed(self.parts.projector),
             self.parts.evaluation.divergence_bound,
             self.device,
-            self.estimate if self.parts.enforcement.weighs and behaviour is not None else None,
+            self.estimate if self.parts.enforcement.weighs and self.behaviour is not None else None,
         )
 
-    @property
+    def rehearse(self, recipe: Recipe) -> None:
+        """Plan once with a network that has learned nothing, near a demonstration, so as not to train it in vain.
+
+        Raises:
+            DadiffError: if its plans could not be enforced or evaluated as they are asked for.
+        """
+        network = recipe.build(self.layout, self._told, self.parts.schedule, torch_generator(0, "rehearsal"))
+        shown, robots = self.demonstrations, self.target.robots
+        E, tau = (np.tile(a[:1], (*robots, 1, 1)) for a in (shown.environment, shown.trajectories))
+        self._planner(self._encoded(network.to(self.device))).rehearse(E, tau)
+
+    @cached_property
     def estimate(self) -> Estimate:
         """How uncertain the clean estimate is: of an exact denoiser by its law, else by the demonstrations."""
         shown, where = self.demonstrations, self.coordinates
@@ -267,18 +290,25 @@ class Experiment:
 
     def _trained(self, recipe: Recipe) -> NetworkDenoiser | EncodedDenoiser:
         from dadiff.denoisers.checkpoints import load
-        from dadiff.denoisers.encoded import EncodedDenoiser
 
         if self.identity.denoiser is None:
             raise ConfigError("denoiser: it is neither trainable nor exact; see Recipe and ExactRecipe")
         folder = self._cached(self.identity.denoiser, partial(self._train, recipe), resumable=True)
         file, schedule = folder / "model.safetensors", self.parts.schedule
-        network = load(file, recipe, self.layout, self._told, schedule).to(self.device)
-        return EncodedDenoiser(network, self.encoder, self.coordinates, schedule) if self.encoder else network
+        return self._encoded(load(file, recipe, self.layout, self._told, schedule).to(self.device))
+
+    def _encoded(self, network: NetworkDenoiser) -> NetworkDenoiser | EncodedDenoiser:
+        from dadiff.denoisers.encoded import EncodedDenoiser
+
+        if self.encoder is None:
+            return network
+        return EncodedDenoiser(network, self.encoder, self.coordinates, self.parts.schedule)
 
     def _train(self, recipe: Recipe, folder: Path) -> None:
         from dadiff.denoisers.learning import train
 
+        if len(self.demonstrations.trajectories):
+            self.rehearse(recipe)
         task, (told, learned) = self.parts.task, self._learned
         train(
             recipe,
