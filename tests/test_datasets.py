@@ -14,7 +14,7 @@ from dadiff.behaviours import Hankel, Known, Transitions, compared
 from dadiff.config.build import build
 from dadiff.datasets import Generated, NpzRecordings, NpzTrajectories
 from dadiff.datasets.cached import load_data, save_data
-from dadiff.datasets.files import read_array
+from dadiff.datasets.logs import read_runs
 from dadiff.errors import ConfigError, DataError, NotApplicableError
 from dadiff.systems import GaussianExcitation, Linear, double_integrator
 from dadiff.tasks import LQR, Demonstrations
@@ -167,13 +167,13 @@ class Bomb:
 
 
 BAD = {
-    "missing": ({"states": None}, "has no array states; found inputs, initial_state, target_state"),
+    "missing": ({"states": None}, "has no array states or observations; found inputs, initial_state, target_state"),
     "no inputs": ({"inputs": None}, "has no array inputs or controls; found"),
     "nan": ({"states": np.full((7, 4), np.nan)}, "array states holds a value that is not finite"),
     "infinite": ({"target_state": np.full(4, np.inf)}, "array target_state holds a value that is not finite"),
-    "horizon": ({"states": np.zeros((9, 4))}, r"array states has shape (9, 4); expected (7, 4)"),
-    "state_dim": ({"states": np.zeros((7, 3))}, r"array states has shape (7, 3); expected (7, 4)"),
-    "input_dim": ({"inputs": np.zeros((6, 1))}, r"array inputs or controls has shape (6, 1); expected (6, 2)"),
+    "horizon": ({"states": np.zeros((9, 4))}, "has 9 states and 6 inputs; expected one state more"),
+    "state_dim": ({"states": np.zeros((7, 3))}, r"array states has shape (7, 3); expected (any, 4)"),
+    "input_dim": ({"inputs": np.zeros((6, 1))}, r"array inputs has shape (6, 1); expected (any, 2)"),
     "dimensions": ({"initial_state": np.zeros((1, 4))}, r"array initial_state has shape (1, 4); expected (4)"),
     "start": ({"initial_state": np.ones(4)}, "initial_state is [1.0, 1.0, 1.0, 1.0], but states begin at ["),
     "text": ({"states": np.array([["a"] * 4] * 7)}, "array states holds <U1; expected real numbers"),
@@ -215,7 +215,8 @@ def test_a_damaged_file_is_named(folder, kind):
     np.savez_compressed(file, **arrays) if kind == "overwritten" else None
     file.write_bytes(damaged(file.read_bytes())[kind])
     with pytest.raises(
-        DataError, match=f"^{re.escape(str(file))}: (is not a readable|array states cannot be read|has no)"
+        DataError,
+        match=f"^{re.escape(str(file))}: (is not a readable|an array cannot|array states cannot|has no)",
     ):
         NpzTrajectories(str(folder)).train(TASK, SYSTEM)
 
@@ -226,14 +227,14 @@ def test_every_truncation_of_a_file_is_refused(folder):
     for length in range(0, len(whole), 61):
         file.write_bytes(whole[:length])
         with pytest.raises(DataError, match=re.escape(str(file))):
-            read_array(file, ["states"], (7, 4))
+            read_runs(file, SYSTEM, None)
 
 
 def test_an_array_that_is_not_in_an_archive_is_refused(tmp_path):
     with (tmp_path / "a.npz").open("wb") as stream:
         np.save(stream, np.zeros(3))
     with pytest.raises(DataError, match=r"a\.npz: is not a readable \.npz file; write it with numpy\.savez"):
-        read_array(tmp_path / "a.npz", ["states"], (3,))
+        read_runs(tmp_path / "a.npz", SYSTEM, None)
 
 
 @pytest.mark.parametrize("part", ["train", "test"])
@@ -241,7 +242,7 @@ def test_empty_and_missing_folders_are_named(folder, part):
     data = NpzTrajectories(str(folder))
     for file in (folder / part).iterdir():
         file.unlink()
-    with pytest.raises(DataError, match=rf"{part}: holds no \.npz file"):
+    with pytest.raises(DataError, match=rf"{part}: holds no file that ends in \.npz, \.csv"):
         data.determined_by(part)
     (folder / part).rmdir()
     with pytest.raises(DataError, match=f"{part}: there is no such folder"):

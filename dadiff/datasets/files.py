@@ -1,7 +1,4 @@
-"""Trajectories in folders of .npz files, one file a trajectory, from any source.
-
-Files are read without pickle, so nothing in them is executed. Every complaint names the file and the array.
-"""
+"""Own recordings: folders of files from any source, held against the system. Nothing in them is executed."""
 
 from __future__ import annotations
 
@@ -14,19 +11,14 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
 import numpy as np
 
 from dadiff.datasets.excitation import check_excited, tell_held
-from dadiff.datasets.generated import Part
-from dadiff.datasets.logs import ENDINGS, Run, list_logs, read_runs, runs_of, side_by_side
-from dadiff.datasets.physics import judge, judge_runs, plant_of, tell_offset, tell_shifted
+from dadiff.datasets.logs import Run, content_of, list_logs, read_runs, runs_of, saying, side_by_side
+from dadiff.datasets.physics import judge_runs, plant_of, tell_offset, tell_shifted
 from dadiff.datasets.tables import Columns, arrays_of_table
-from dadiff.errors import ConfigError, DataError, NotApplicableError
-from dadiff.outside import digest_of, npz
+from dadiff.errors import DataError, NotApplicableError
 from dadiff.systems import Recording, System, TimeVarying
-from dadiff.tasks import Cases, Demonstrations, Task
 
 if TYPE_CHECKING:
     import pandas as pd
-
-INPUT_NAMES = ("inputs", "controls")
 
 log = logging.getLogger(__name__)
 
@@ -38,133 +30,6 @@ class FromFiles(Protocol):
     def fingerprint(self) -> str:
         """A hash of the content."""
         ...
-
-
-def list_files(folder: Path) -> list[Path]:
-    """The .npz files of a folder, sorted by name.
-
-    Raises:
-        DataError: if the folder is missing or holds none.
-    """
-    if not folder.is_dir():
-        raise DataError(f"{folder}: there is no such folder; expected a folder of .npz files")
-    files = sorted(folder.glob("*.npz"))
-    if not files:
-        raise DataError(f"{folder}: holds no .npz file; expected one for each trajectory")
-    return files
-
-
-def fingerprint(folder: Path) -> str:
-    """A hash of the names and contents of all .npz files below a folder."""
-    return digest_of(sorted(folder.rglob("*.npz")), folder)
-
-
-def read_array(file: Path, names: Sequence[str], shape: tuple[int | None, ...], remedy: str = "") -> np.ndarray:
-    """One float64 array from an .npz file.
-
-    Args:
-        names: accepted names, the first that is there is read.
-        shape: expected shape; None accepts any length.
-        remedy: what to do if it is missing or has another shape.
-
-    Raises:
-        DataError: if it is missing, holds objects, has another shape, or values that are not finite.
-    """
-    label = " or ".join(names)
-    array = _first_of(file, names, label, remedy)
-    if array.dtype.kind not in "fiu":
-        raise DataError(f"{file}: array {label} holds {array.dtype}; expected real numbers")
-    expected = "(" + ", ".join("any" if k is None else str(k) for k in shape) + ")"
-    if array.ndim != len(shape) or any(k not in (None, size) for k, size in zip(shape, array.shape, strict=True)):
-        raise DataError(f"{file}: array {label} has shape {array.shape}; expected {expected}{remedy}")
-    if not np.isfinite(array).all():
-        raise DataError(f"{file}: array {label} holds a value that is not finite")
-    return array.astype(np.float64)
-
-
-def _first_of(file: Path, names: Sequence[str], label: str, remedy: str) -> np.ndarray:
-    with npz(file, f"array {label}") as archive:
-        present = [name for name in names if name in archive.files]
-        if not present:
-            raise DataError(f"{file}: has no array {label}; found {', '.join(archive.files) or 'none'}{remedy}")
-        return np.asarray(archive[present[0]])
-
-
-@dataclass(frozen=True)
-class NpzTrajectories:
-    """Demonstrations and test cases from `path`/train and `path`/test.
-
-    Each file holds `states (T+1, n)`, `inputs` or `controls (T, m)`, `initial_state (n,)` and `target_state (n,)`;
-    other arrays are ignored. The reference of a test case is its stored trajectory, and E = [x_init; x_target].
-
-    Args:
-        path: the folder.
-        train_size, test_size: how many files to take, in the order of their names; None takes all.
-        allow_mismatch: take data that do not obey the configured system, with a warning.
-    """
-
-    path: str
-    train_size: int | None = None
-    test_size: int | None = None
-    allow_mismatch: bool = False
-
-    def determined_by(self, part: Part) -> dict[str, Any]:
-        """What the folder holds, in place of where it lies."""
-        list_files(folder := Path(self.path) / part)
-        return {"content": fingerprint(folder), "size": self.train_size if part == "train" else self.test_size}
-
-    def train(self, task: Task, system: System) -> Demonstrations:
-        """The trajectories of `path`/train."""
-        tau, environment = self._read("train", task, system, self.train_size)
-        copies = len(tau) - len({row.tobytes() for row in tau})
-        if copies:
-            log.warning("%s/train: %d of %d trajectories are copies of others", self.path, copies, len(tau))
-        residual = self._judged("train", system, task.horizon, tau, tau)
-        return Demonstrations(tau, environment, {"residual": residual, "copies": copies})
-
-    def test(self, task: Task, system: System) -> Cases:
-        """The cases of `path`/test."""
-        tau, environment = self._read("test", task, system, self.test_size)
-        learned, _ = self._read("train", task, system, self.train_size)
-        shared = len({row.tobytes() for row in learned} & {row.tobytes() for row in tau})
-        if shared:
-            log.warning("%s: %d of %d test trajectories are also in train", self.path, shared, len(tau))
-        residual = self._judged("test", system, task.horizon, tau, learned)
-        return Cases(task.condition(system), environment, tau, {"also_in_train": shared, "residual": residual})
-
-    def _judged(self, part: Part, system: System, horizon: int, tau: np.ndarray, learned: np.ndarray) -> float:
-        """How well trajectories (N, d) obey the system; of an unknown one, those that are learned from."""
-        layout, folder = system.layout(horizon), Path(self.path) / part
-        runs = list(zip(*layout.split(learned), strict=True))
-        plant = plant_of(system, runs)
-        if plant.learned and part == "train":
-            tell_shifted(runs, str(folder))
-        names = [file.name for file in list_files(folder)[: len(tau)]]
-        return judge(plant, *layout.split(tau), str(folder), self.allow_mismatch, names)
-
-    def _read(self, part: str, task: Task, system: System, count: int | None) -> tuple[np.ndarray, np.ndarray]:
-        if not isinstance(system, System) or system.robots:
-            raise ConfigError("dataset: npz trajectories belong to one system, and here are several robots")
-        n, m, T = system.state_dim, system.input_dim, task.horizon
-        condition = task.condition(system)
-        if condition.names != ("x_init", "target") or condition.size != 2 * n:
-            fields = ", ".join(f"{channel.name} ({channel.size})" for channel in condition.channels)
-            raise ConfigError(
-                f"dataset: npz files give E = [x_init ({n}); target ({n})], but the task's E has {fields}; use "
-                "dataset=environments for own environments of the obstacle task"
-            )
-        files = list_files(Path(self.path) / part)[:count]
-        fit = f"; the task has {T} inputs and one state more: set task.horizon, cut, or add the state that is missing"
-        states = np.stack([read_array(f, ["states"], (T + 1, n), fit) for f in files])
-        inputs = np.stack([read_array(f, INPUT_NAMES, (T, m), fit) for f in files])
-        add = "; add it: a trajectory's E is where it starts and where it should go"
-        x_init, target = (
-            np.stack([read_array(f, [name], (n,), add) for f in files]) for name in ("initial_state", "target_state")
-        )
-        for file, start, first in zip(files, x_init, states[:, 0], strict=True):
-            if not np.allclose(start, first, rtol=1e-4, atol=1e-6):
-                raise DataError(f"{file}: initial_state is {start.tolist()}, but states begin at {first.tolist()}")
-        return system.layout(T).flatten(states, inputs), condition.pack(x_init=x_init, target=target)
 
 
 @dataclass(frozen=True)
@@ -191,7 +56,7 @@ class NpzRecordings:
         folder = Path(self.path)
         if not any(folder.glob("robot_*/*")):
             list_logs(folder)
-        return digest_of(sorted(file for file in folder.rglob("*") if file.suffix in ENDINGS), folder)
+        return content_of(folder)
 
     def record(self, system: System) -> Recording:
         """All runs side by side.
@@ -216,7 +81,8 @@ class NpzRecordings:
         return _together(folders, [self._read(folder, system, robot) for robot, folder in enumerate(folders)])
 
     def _read(self, folder: Path, system: System, robot: int | None = None) -> Recording:
-        runs = {str(file): read_runs(file, system, self.columns) for file in list_logs(folder)}
+        with saying():
+            runs = {str(file): read_runs(file, system, self.columns) for file in list_logs(folder)}
         return self.judged(runs, str(folder), system, robot)
 
     def judged(

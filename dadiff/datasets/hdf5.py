@@ -6,6 +6,7 @@ Minari has a group for each episode, with `observations` (T+1, n) and `actions` 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +20,11 @@ from dadiff.outside import regular
 FLAGS = ("terminals", "timeouts", "terminations", "truncations")
 
 
-def from_hdf5(file: Path) -> list[Arrays]:
+def from_hdf5(file: Path, beside: Sequence[str] = ()) -> list[Arrays]:
     """The arrays of each episode, or of all in one with the rows at which they end.
+
+    Args:
+        beside: names of arrays that are read, too.
 
     Raises:
         ConfigError: if h5py is not installed.
@@ -33,7 +37,8 @@ def from_hdf5(file: Path) -> list[Arrays]:
     try:
         with h5py.File(regular(file), "r") as content:
             episodes = sorted((name for name in content if name.startswith("episode_")), key=_number)
-            return [_arrays(content[name], f"{file}: {name}") for name in episodes] or [_arrays(content, str(file))]
+            parts = {f"{file}: {name}": content[name] for name in episodes} or {str(file): content}
+            return [_arrays(part, where, beside) for where, part in parts.items()]
     except (OSError, ValueError, KeyError, RuntimeError) as error:
         raise DataError(f"{file}: cannot be read as HDF5 ({' '.join(str(error).split())})") from error
 
@@ -43,8 +48,8 @@ def _number(name: str) -> tuple[int, str]:
     return (int(digits) if digits.isdigit() else 0, name)
 
 
-def _arrays(group: Any, where: str) -> dict[str, np.ndarray]:
-    wanted = (*STATES, *INPUTS, *TIMES, *STEPS, ENDS, *FLAGS)
+def _arrays(group: Any, where: str, beside: Sequence[str]) -> dict[str, np.ndarray]:
+    wanted = (*STATES, *INPUTS, *TIMES, *STEPS, ENDS, *FLAGS, *beside)
     found = {name: _read(_inside(group, name, where), f"{where}: {name}") for name in wanted if name in group}
     flags = [np.ravel(found.pop(name)).astype(bool) for name in FLAGS if name in found]
     states = next((found[name] for name in STATES if name in found), None)

@@ -1,4 +1,4 @@
-"""Recordings as people have them: files of several kinds, as runs of states (S+1, n) and inputs (S, m).
+"""Recordings and demonstrations as people have them: files, as runs of states (S+1, n) and inputs (S, m).
 
 What can be read in one way only is taken: a trailing axis of one, a batch axis, integers, switches, as many states as
 inputs (the last input has no next state and is dropped), several episodes in one file, which `episode_ends` or a column
@@ -8,14 +8,17 @@ separates, or time stamps that jump. Everything else is refused with the remedy.
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
 from dadiff.datasets.tables import ENDS, INPUTS, STATES, STEPS, TIMES, Arrays, Columns, from_table
 from dadiff.errors import DataError
-from dadiff.outside import npz
+from dadiff.outside import digest_of, npz
 from dadiff.systems import System
 
 TABLES, HDF5 = (".csv", ".parquet"), (".hdf5", ".h5")
@@ -28,7 +31,28 @@ UNITS_OF_TIME = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds"}
 
 Run = tuple[np.ndarray, np.ndarray]
 
+MOST_SAID = 3
+"""How often the same is said of the files of a folder."""
+
 log = logging.getLogger(__name__)
+
+
+@contextmanager
+def saying(most: int = MOST_SAID) -> Iterator[None]:
+    """While many files are read: the same is said of a few of them only, and then of how many more it holds."""
+    said = Counter[str]()
+
+    def first_ones(record: logging.LogRecord) -> bool:
+        said[record.msg] += 1
+        return said[record.msg] <= most
+
+    log.addFilter(first_ones)
+    try:
+        yield
+    finally:
+        log.removeFilter(first_ones)
+    if more := sum(count - most for count in said.values() if count > most > 0):
+        log.warning("... and so on, %d times more", more)
 
 
 def list_logs(folder: Path) -> list[Path]:
@@ -46,6 +70,11 @@ def list_logs(folder: Path) -> list[Path]:
     return files
 
 
+def content_of(folder: Path) -> str:
+    """A hash of the names and contents of all files below a folder that hold recordings or demonstrations."""
+    return digest_of(sorted(file for file in folder.rglob("*") if file.suffix in ENDINGS), folder)
+
+
 def read_runs(file: Path, system: System, columns: Columns | None) -> list[Run]:
     """The runs in a file, each states (S+1, n) and inputs (S, m) in float64.
 
@@ -58,8 +87,8 @@ def read_runs(file: Path, system: System, columns: Columns | None) -> list[Run]:
     return [run for arrays in arrays_of(file, columns) for run in runs_of(arrays, str(file), system)]
 
 
-def arrays_of(file: Path, columns: Columns | None) -> list[Arrays]:
-    """What a file holds under the names that are known here, one mapping for each of its parts.
+def arrays_of(file: Path, columns: Columns | None, beside: Sequence[str] = ()) -> list[Arrays]:
+    """What a file holds under the names that are known here, and `beside`: one mapping for each of its parts.
 
     Raises:
         DataError: if it cannot be read, or does not say what is what.
@@ -67,21 +96,31 @@ def arrays_of(file: Path, columns: Columns | None) -> list[Arrays]:
     if file.suffix in HDF5:
         from dadiff.datasets.hdf5 import from_hdf5
 
-        return from_hdf5(file)
-    return [_from_npz(file)] if file.suffix == ".npz" else from_table(file, columns)
+        return from_hdf5(file, beside)
+    return [_from_npz(file, beside)] if file.suffix == ".npz" else from_table(file, columns)
 
 
-def runs_of(arrays: Arrays, where: str, system: System) -> list[Run]:
-    """The runs in arrays that are called as in a file; see `read_runs`."""
+def runs_of(arrays: Arrays, where: str, system: System, beside: Sequence[str] = ()) -> list[Run]:
+    """The runs in arrays that are called as in a file; see `read_runs`.
+
+    Args:
+        beside: names of arrays of n numbers for the file, for each run or for each state; those that are there follow
+            the states as n more columns each.
+    """
     stamps = _time_stamps(where, arrays, system.time_step)
     states = _plain(where, arrays, STATES, system.state_dim)
     inputs = _plain(where, arrays, INPUTS, system.input_dim)
-    runs = [_paired(where, x, u) for x, u in _batches(where, states, inputs)]
-    return _episodes(where, runs, _ends(where, arrays, stamps))
+    said = [int(end) for end in np.ravel(_finite(where, ENDS, arrays[ENDS]))] if ENDS in arrays else []
+    more = [_a_state(where, name, arrays, states, said) for name in beside if name in arrays]
+    together = np.concatenate([states, *more], axis=-1)
+    runs = [_paired(where, x, u) for x, u in _batches(where, together, inputs)]
+    if not (runs := _episodes(where, runs, _ends(where, said, stamps))):
+        raise DataError(f"{where}: no episode has two states; expected runs of at least one step")
+    return runs
 
 
-def _from_npz(file: Path) -> dict[str, np.ndarray]:
-    wanted, found = (*STATES, *INPUTS, *TIMES, *STEPS, ENDS), dict[str, np.ndarray]()
+def _from_npz(file: Path, beside: Sequence[str]) -> dict[str, np.ndarray]:
+    wanted, found = (*STATES, *INPUTS, *TIMES, *STEPS, ENDS, *beside), dict[str, np.ndarray]()
     with npz(file) as archive:
         names = [str(name) for name in archive.files]
     if not set(names) & set(STATES) and "y" in names:
@@ -100,9 +139,7 @@ def _plain(where: str, arrays: Arrays, names: Sequence[str], size: int) -> np.nd
     name = next((name for name in names if name in arrays), None)
     if name is None:
         raise DataError(f"{where}: has no array {' or '.join(names[:2])}; found {', '.join(arrays) or 'none of use'}")
-    values = arrays[name]
-    if values.dtype.kind not in "fiub":
-        raise DataError(f"{where}: array {name} holds {values.dtype}; expected real numbers")
+    values = _real(where, name, arrays[name])
     if values.ndim == 1 and size == 1:
         values = values[:, None]
     if values.ndim == 3 and values.shape[-1] == 1 and values.shape[-2] == size:
@@ -112,13 +149,36 @@ def _plain(where: str, arrays: Arrays, names: Sequence[str], size: int) -> np.nd
         what = "states" if names == STATES else "inputs"
         remedy = "; transpose it?" if turned else f"; the system has {size} {what}: choose columns, or another system"
         raise DataError(f"{where}: array {name} has shape {values.shape}; expected (any, {size}){remedy}")
-    if not np.isfinite(values.astype(np.float64)).all():
-        row = int(np.argwhere(~np.isfinite(values.astype(np.float64)))[0][-2])
-        raise DataError(
-            f"{where}: array {name} holds a value that is not finite, first in row {row}; cut there into "
-            "episodes (episode_ends), without that row"
-        )
+    return _finite(where, name, values)
+
+
+def _finite(where: str, name: str, values: np.ndarray) -> np.ndarray:
+    """Numbers as float64, every one of them finite."""
+    values = _real(where, name, values)
+    if (odd := np.argwhere(~np.isfinite(values))).size:
+        cut = "cut there into episodes (episode_ends), without that row"
+        at = f", first in row {odd[0][-2]}; {cut}" if values.ndim > 1 else ""
+        raise DataError(f"{where}: array {name} holds a value that is not finite{at}")
+    return values
+
+
+def _real(where: str, name: str, values: np.ndarray) -> np.ndarray:
+    """Numbers or switches as float64."""
+    if values.dtype.kind not in "fiub":
+        raise DataError(f"{where}: array {name} holds {values.dtype}; expected real numbers")
     return values.astype(np.float64)
+
+
+def _a_state(where: str, name: str, arrays: Arrays, states: np.ndarray, ends: Sequence[int]) -> np.ndarray:
+    """A state of the file (n,), of each run or episode (count, n), or of each row, as rows beside the states."""
+    values, n = _finite(where, name, arrays[name]), states.shape[-1]
+    if states.ndim == 3 and values.shape == (len(states), n):
+        values = values[:, None]
+    elif ends and values.shape == (len(ends), n):
+        values = values[np.searchsorted(ends[:-1], np.arange(len(states)), side="right")]
+    elif values.shape not in ((n,), states.shape):
+        raise DataError(f"{where}: array {name} has shape {values.shape}; expected ({n}), of all, each run or each row")
+    return np.broadcast_to(values, states.shape)
 
 
 def _batches(where: str, states: np.ndarray, inputs: np.ndarray) -> list[Run]:
@@ -139,16 +199,15 @@ def _paired(where: str, states: np.ndarray, inputs: np.ndarray) -> Run:
     return states, inputs
 
 
-def _ends(where: str, arrays: Arrays, stamps: np.ndarray | None) -> list[int] | None:
+def _ends(where: str, said: list[int], stamps: np.ndarray | None) -> list[int]:
     """The rows before which an episode ends: as said, and where time jumps or starts anew."""
-    said = [int(end) for end in np.ravel(arrays[ENDS])] if ENDS in arrays else []
     if stamps is None or len(stamps) < 3:
-        return said if ENDS in arrays else None
+        return said
     steps = np.diff(stamps)
     usual = float(np.median(steps))
     jumps = [int(k) + 1 for k in np.flatnonzero((steps <= 0) | (steps > JUMP * usual)) if k + 1 not in said]
     if not jumps:
-        return said if ENDS in arrays else None
+        return said
     log.warning(
         "%s: its time stamps jump before row %s: cut there into episodes",
         where,
@@ -157,19 +216,18 @@ def _ends(where: str, arrays: Arrays, stamps: np.ndarray | None) -> list[int] | 
     return sorted({*said, *jumps, len(stamps)})
 
 
-def _episodes(where: str, runs: list[Run], places: list[int] | None) -> list[Run]:
+def _episodes(where: str, runs: list[Run], places: list[int]) -> list[Run]:
     """Cut where an episode ends: the step from its last state to the next one's first is none of the system's."""
-    if places is None:
+    if not places:
         return runs
     if len(runs) != 1:
         raise DataError(f"{where}: has {len(runs)} runs along a batch axis, and {ENDS}; give one or the other")
     states, inputs = runs[0]
-    if sorted(set(places)) != places or not places or not places[0] > 0 or places[-1] > len(states):
+    if sorted(set(places)) != places or not places[0] > 0 or places[-1] > len(states):
         raise DataError(f"{where}: {ENDS} is {places[:6]}; expected rising numbers of rows, at most {len(states)}")
-    starts, last = [0, *places[:-1]], places[-1] >= len(inputs)
-    cut = [(states[a:b], inputs[a : b - 1]) for a, b in zip(starts, places, strict=True)]
-    if last:
-        cut[-1] = (states[starts[-1] :], inputs[starts[-1] :])
+    starts: list[int] = [0, *(end for end in places if end < len(inputs))]
+    cut = [(states[a:b], inputs[a : b - 1]) for a, b in pairwise(starts)]
+    cut.append((states[starts[-1] :], inputs[starts[-1] :]))
     return [(x, u) for x, u in cut if len(u)]
 
 
@@ -180,7 +238,9 @@ def _time_stamps(where: str, arrays: Arrays, time_step: float | None) -> np.ndar
         DataError: if the usual step is not the system's.
     """
     stamps = next((np.ravel(arrays[name]) for name in TIMES if name in arrays), None)
-    said = next((float(np.ravel(arrays[name])[0]) for name in STEPS if name in arrays), None)
+    said = next(
+        (float(step) for name in STEPS if name in arrays for step in _finite(where, name, arrays[name]).flat), None
+    )
     if stamps is not None and stamps.dtype.kind in "fiu" and len(stamps) > 1:
         stamps = stamps.astype(np.float64)
         steps = np.diff(stamps)

@@ -1,4 +1,4 @@
-"""Tables as recordings: .csv and .parquet files and data frames, one row a time step, columns by name.
+"""Tables: .csv and .parquet files and data frames, one row a time step, columns by name.
 
 Of LeRobot's episodes (`observation.state`, `action`, `episode_index`, `timestamp`) nothing needs to be said.
 """
@@ -28,7 +28,9 @@ LEROBOT = {
     "episode": ["episode_index"],
     "time": ["timestamp"],
 }
-PARTS = ("states", "inputs", "episode", "time")
+PARTS = ("states", "inputs", "episode", "time", "target")
+TARGET, START = "target_state", "initial_state"
+"""What demonstrations may have besides: where they should go, and where they say that they begin."""
 
 Columns = Mapping[str, str | Sequence[str]]
 Arrays = Mapping[str, np.ndarray]
@@ -38,7 +40,7 @@ def from_table(file: Path, columns: Columns | None) -> list[Arrays]:
     """The arrays of a table, one mapping for each episode.
 
     Args:
-        columns: which are `states` and which `inputs`; and, if there is one, the `episode` and the `time`.
+        columns: which are `states` and which `inputs`; and, if there is one, the `episode`, `time` and `target`.
 
     Raises:
         DataError: if it is no table, or a column is not said, not there, or holds no numbers.
@@ -64,8 +66,8 @@ def _chosen(table: pd.DataFrame, columns: Columns | None, where: str) -> dict[st
         columns = {part: names for part, names in LEROBOT.items() if names[0] in table.columns}
     if not columns or {"states", "inputs"} - set(columns):
         raise DataError(
-            f"{where}: say which columns are which: recording.columns={{states: [x, y], inputs: [u]}}; "
-            f"found {', '.join(table.columns)}"
+            f"{where}: say which columns are which: recording.columns={{states: [x, y], inputs: [u]}}, of "
+            f"demonstrations dataset.columns; found {', '.join(table.columns)}"
         )
     if odd := set(columns) - set(PARTS):
         raise DataError(f"{where}: columns has '{min(odd)}'; expected {', '.join(PARTS)}")
@@ -77,8 +79,11 @@ def _chosen(table: pd.DataFrame, columns: Columns | None, where: str) -> dict[st
 
 
 def _arrays(table: pd.DataFrame, chosen: Mapping[str, Sequence[str]], where: str) -> dict[str, np.ndarray]:
+    names = {"states": "states", "inputs": "inputs", "target": TARGET}
     made = {
-        part: np.concatenate([_numbers(table, c, where) for c in chosen[part]], -1) for part in ("states", "inputs")
+        name: np.concatenate([_numbers(table, c, where) for c in chosen[part]], -1)
+        for part, name in names.items()
+        if part in chosen
     }
     return made | ({"time": _seconds(table, chosen["time"][0], where)} if "time" in chosen else {})
 
