@@ -6,10 +6,23 @@ import numpy as np
 import pytest
 import torch
 
-from dadiff.behaviours import Dynamics, Identified, IdentifiedSoft, Pin, Stages, doubt
-from dadiff.behaviours.doubt import Doubted
+from dadiff.behaviours import (
+    Doubted,
+    DoubtedManifold,
+    Dynamics,
+    Identified,
+    IdentifiedSoft,
+    IdentifiedSparse,
+    IdentifiedSparseSoft,
+    Manifold,
+    Pin,
+    Stages,
+    doubt,
+)
+from dadiff.behaviours.least_squares import Transitions, significant
 from dadiff.errors import NotApplicableError
-from dadiff.systems import GaussianExcitation, double_integrator
+from dadiff.systems import GaussianExcitation, PlanarQuadrotor, double_integrator
+from dadiff.systems.features import Features, Regressed
 from dadiff.trajectory import TrajectoryLayout
 from dadiff.trajectory.coordinates import Coordinates
 from dadiff.trajectory.covariance import Covariance
@@ -108,3 +121,81 @@ def test_it_needs_no_demonstrations_and_refuses_what_is_too_long(monkeypatch):
     monkeypatch.setattr(doubt, "DOUBTED_UP_TO", 10)
     with pytest.raises(NotApplicableError, match=r"use projector\.residual=averaged"):
         made.bind()
+
+
+@pytest.mark.parametrize("noise", [False, True], ids=["mean", "draw"])
+@pytest.mark.parametrize("pinned", [False, True], ids=["free", "pinned"])
+@pytest.mark.parametrize("offset", ["none", "estimated"])
+def test_of_linear_dynamics_the_features_know_as_much(offset, pinned, noise, rng):
+    """Doubted features of x and u alone, by recursion, are doubted matrices, written densely."""
+    system = double_integrator(process_noise=0.05)
+    layout, recording = system.layout(6), GaussianExcitation(40).record(system)
+    C = Covariance(rng.uniform(0.5, 2, layout.size), rng.standard_normal((layout.size, 4)))
+    where = Coordinates(rng.standard_normal(layout.size), rng.uniform(0.5, 2, layout.size))
+    pins = (Pin.initial_state(layout, rng.standard_normal((5, 4))),) if pinned else ()
+    z, eps = rng.standard_normal((2, 5, layout.size))
+    matrices, terms = (
+        IdentifiedSoft(offset=offset, features=features).fit(layout, system, recording)
+        for features in ((), ("identity",))
+    )
+    plain, features = (made.bind(where, pins) for made in (matrices, terms))
+    flat = [made.root.reshape(-1, k := made.root.shape[-1]) for made in (matrices, terms)]
+    same = eps[..., :k] @ np.linalg.lstsq(*flat)[0].T  # two roots of one covariance differ by a rotation
+    drawn = (np.pad(same, ((0, 0), (0, layout.size - k))), eps) if noise else (None, None)
+    for metric in (None, C):
+        found = features(z, metric, noise=drawn[1])
+        np.testing.assert_allclose(found, plain(z, metric, noise=drawn[0]), atol=1e-9)
+    tensors = features(torch.from_numpy(z), C, noise=torch.from_numpy(eps) if noise else None)
+    np.testing.assert_allclose(tensors, features(z, C, noise=drawn[1]), atol=1e-12)
+
+
+FLYING = ("constant", "identity", "trigonometric", "turning", "control_affine")
+
+
+def flown(robots: int = 2) -> tuple[Regressed, np.ndarray]:
+    """Quadrotors of known features, and a small doubt about all of them."""
+    fleet = PlanarQuadrotor(thrust_gain=np.ones(robots), torque_gain=np.ones(robots), drag=np.zeros(robots))
+    recording = GaussianExcitation(200, 3.0, process_noise=1e-3).record(fleet)
+    found = significant(Transitions.of(recording.states, recording.inputs), Features(6, 2, FLYING, (2,)), 4.0)
+    return found.system, found.root
+
+
+def test_of_nonlinear_dynamics_it_comes_to_rest_at_the_most_probable_plan_and_errors(rng, monkeypatch):
+    """There G tau - g of the dynamics themselves is V e, with tau - tau_hat = -C G' l and e = V' l."""
+    system, root = flown()
+    layout = system.layout(8)
+    C = Covariance(rng.uniform(0.5, 1, layout.size), 0.3 * rng.standard_normal((layout.size, 3)))
+    made, tau = DoubtedManifold(layout, system, 20, root=root), 0.3 * rng.standard_normal((2, 3, layout.size))
+    monkeypatch.setattr(doubt, "AT_ONCE", 4)  # two plans at a time
+    found = made.bind()(tau, C)
+    x, u = layout.split(found)
+    G, _ = Stages(*system.linearise(x[..., :-1, :], u)).matrix(layout)
+    phi = system.features(x[..., :-1, :], u)
+    V = np.einsum("rptf,rfnk->rptnk", phi, root).reshape(2, 3, 48, -1)
+    residual = (x[..., 1:, :] - system.step(x[..., :-1, :], u)).reshape(2, 3, 48)
+    moved = np.linalg.lstsq((G @ C.matrix @ G.swapaxes(-1, -2))[0, 0], -(G[0, 0] @ (found - tau)[0, 0]))[0]
+    np.testing.assert_allclose((found - tau)[0, 0], -C.matrix @ G[0, 0].T @ moved, atol=1e-8)
+    np.testing.assert_allclose(residual[0, 0], V[0, 0] @ (V[0, 0].T @ moved), atol=1e-8)
+
+
+def test_nonlinear_dynamics_that_are_hardly_doubted_are_the_manifold(rng):
+    system, root = flown()
+    layout = system.layout(8)
+    C, tau = Covariance.diagonal_of(np.ones(layout.size)), 0.3 * rng.standard_normal((2, 3, layout.size))
+    pins = (Pin.initial_state(layout, 0.3 * rng.standard_normal((2, 3, 6))),)
+    hard = Manifold(layout, system, 20).bind(pins=pins)(tau, C)
+    soft = DoubtedManifold(layout, system, 20, root=1e-6 * root).bind(pins=pins)(tau, C)
+    np.testing.assert_allclose(soft, hard, atol=1e-5)
+
+
+def test_of_sparse_dynamics_only_the_terms_that_are_kept_are_doubted():
+    recording = GaussianExcitation(200, 3.0, process_noise=1e-3).record(PlanarQuadrotor())
+    layout = PlanarQuadrotor().layout(8)
+    hard, soft = (
+        kind(features=FLYING, angles=(2,)).fit(layout, PlanarQuadrotor(), recording)
+        for kind in (IdentifiedSparse, IdentifiedSparseSoft)
+    )
+    np.testing.assert_array_equal(hard.system.theta, soft.system.theta)
+    np.testing.assert_array_equal(soft.system.theta != 0, soft.root.any(axis=-1).T)
+    with pytest.raises(NotApplicableError, match="use projector=identified_sparse"):
+        IdentifiedSparseSoft(features=FLYING, angles=(2,), bounds="enforced").fit(layout, PlanarQuadrotor(), recording)

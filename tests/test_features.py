@@ -21,7 +21,7 @@ from dadiff.behaviours import (
     pins,
     prediction_error,
 )
-from dadiff.errors import ConfigError, ExcitationError, NotApplicableError, ShapeError
+from dadiff.errors import ConfigError, ExcitationError, ShapeError
 from dadiff.systems import GaussianExcitation, PlanarQuadrotors, Recording, Simulated, double_integrator
 from dadiff.systems.features import Features, Regressed
 from dadiff.trajectory.covariance import Covariance
@@ -152,9 +152,8 @@ def test_what_makes_no_sense_is_refused(rng):
         Regressed(Features(3, 2), np.zeros((3, 7)))
     with pytest.raises(ExcitationError, match="10 transitions span 10 of the 17 features"):
         Identified(features=("constant", "identity", "products")).fit(layout, system, recording)
-    soft, shown = IdentifiedSoft(features=("identity",)), rng.standard_normal((9, layout.size))
-    with pytest.raises(NotApplicableError, match="use projector=identified"):
-        soft.fit(layout, system, recording, shown)
+    with pytest.raises(ConfigError, match=r"use projector\.residual=each"):
+        IdentifiedSoft(features=("identity",), residual="averaged")
 
 
 @pytest.mark.parametrize("directions", [0, 4])

@@ -1,8 +1,8 @@
 """Behaviours: the sets of admissible trajectories, what they are learned from, and the projections onto them."""
 
-from dadiff.behaviours.doubt import Doubted
+from dadiff.behaviours.doubt import Doubted, DoubtedManifold
 from dadiff.behaviours.family import IdentifiedFamily
-from dadiff.behaviours.identified import Identified, IdentifiedSoft, IdentifiedSparse, Koopman
+from dadiff.behaviours.identified import Identified, IdentifiedSoft, IdentifiedSparse, IdentifiedSparseSoft, Koopman
 from dadiff.behaviours.known import (
     Inpainting,
     Known,
@@ -28,6 +28,7 @@ from dadiff.behaviours.windows import Hankel, HankelLowRank
 __all__ = [
     "Clipped",
     "Doubted",
+    "DoubtedManifold",
     "Dynamics",
     "Estimate",
     "Everything",
@@ -38,6 +39,7 @@ __all__ = [
     "IdentifiedFamily",
     "IdentifiedSoft",
     "IdentifiedSparse",
+    "IdentifiedSparseSoft",
     "Inpainting",
     "Known",
     "KnownClear",

@@ -11,23 +11,31 @@ corrected as if the dynamics that explain it best were known, while the covarian
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
 
-from dadiff.behaviours.forms import Rows
+from dadiff.behaviours.forms import Blocks, Hold, Rows
+from dadiff.behaviours.manifold import Manifold, Tracker, invertible
+from dadiff.behaviours.pins import Pin, Pinned
 from dadiff.behaviours.projection import Geometry
 from dadiff.behaviours.sets import Dynamics, identity
+from dadiff.behaviours.stages import Stages
 from dadiff.errors import NotApplicableError
+from dadiff.systems.features import Regressed
 from dadiff.trajectory.arrays import Array, join, solve
-from dadiff.trajectory.coordinates import Coordinates
+from dadiff.trajectory.coordinates import Coordinates, physical
 from dadiff.trajectory.covariance import Covariance
 from dadiff.trajectory.layout import TrajectoryLayout
 from dadiff.trajectory.subspace import semidefinite_inverse
 
 DOUBTED_UP_TO = 1500
 """The size d up to which plans are held against doubted dynamics: that takes dense matrices."""
+
+AT_ONCE = 128
+"""Plans whose doubted nonlinear dynamics are in memory at a time."""
 
 ROUNDS = 2
 """How often V is taken at the corrected plan: first at the plan as it comes."""
@@ -144,3 +152,72 @@ def like_identity(V: Array) -> Array:
     """I of the size of V' V, as an array of its kind."""
     unit = np.eye(V.shape[-1])
     return unit if isinstance(V, np.ndarray) else V.new_tensor(unit)
+
+
+@dataclass(frozen=True)
+class DoubtedManifold(Manifold):
+    """The trajectories of x(t+1) = x(t) + Theta phi(x(t), u(t)), Theta' being known up to N(theta_hat, L L').
+
+    As `Doubted`, with G tau - g linearised about the plan that the sweep before gave: each sweep is one of Gauss-Newton
+    for min |tau - tau_hat|^2_C + |e|^2, in O(T).
+
+    Args:
+        root: L of shape (*robots, p, n, k), p being the number of features.
+    """
+
+    system: Regressed
+    root: np.ndarray = field(repr=False, kw_only=True)
+
+    def bind(
+        self, coordinates: Coordinates | None = None, pins: Sequence[Pin] = (), device: str | None = None
+    ) -> DoubtedTracker:
+        """See `Manifold.bind`."""
+        return DoubtedTracker(self, coordinates or physical(self.layout), Pinned.of(pins, self.layout, self.robots))
+
+
+class DoubtedTracker(Tracker):
+    """The correction of plans by doubted nonlinear dynamics; it draws their residual from `noise`.
+
+    Args:
+        target: the dynamics.
+        where: the coordinates.
+        pinned: places and values of the pins.
+    """
+
+    _set: DoubtedManifold
+
+    def __init__(self, target: DoubtedManifold, where: Coordinates, pinned: Pinned) -> None:
+        super().__init__(target, where, pinned)
+        self._pinned = pinned
+
+    def _project(
+        self, z: np.ndarray, metric: Covariance | None, start: np.ndarray | None, noise: np.ndarray | None
+    ) -> np.ndarray:
+        C = invertible(metric or identity(self._set.layout))
+        values = np.broadcast_to(self._pinned.values, (*z.shape[:-1], len(self._pinned.places)))
+        hold = Hold.of(C, self._pinned.places, self._where)
+        about = hold.pin(self._where.to_physical(z if start is None else start), values)
+        corrected = np.empty_like(z)
+        for _ in range(self._set.sweeps):
+            for some in _slices(z.shape[:-1]):
+                own = (..., some, None, slice(None))  # each plan is one of a robot of its own
+                drawn = None if noise is None else noise[own]
+                corrected[..., some, :] = self._along(about[..., some, :], C)(z[own], values[own], drawn)[..., 0, :]
+            about = self._where.to_physical(corrected)
+        return corrected
+
+    def _along(self, tau: np.ndarray, C: Covariance) -> Blocks:
+        """The correction by the dynamics linearised along each of tau (*robots, plans, d)."""
+        layout, system, root = self._set.layout, self._set.system, self._set.root
+        x, u = layout.split(tau)
+        stages = Stages(*system.linearise(x[..., :-1, :], u))
+        V = system.features(x[..., :-1, :], u) @ root.reshape(*root.shape[:-2], -1)[..., None, :, :]
+        V = V.reshape(*V.shape[:-2], -1, root.shape[-1])
+        return Blocks.of(layout, stages, C, self._pinned.places, self._where, V)
+
+
+def _slices(plans: tuple[int, ...]) -> list[slice]:
+    """Of plans (*robots, plans), so many at once that their matrices fit."""
+    *robots, count = plans
+    size = max(1, AT_ONCE // int(np.prod(robots)))
+    return [slice(first, first + size) for first in range(0, count, size)]

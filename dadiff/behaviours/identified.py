@@ -8,9 +8,17 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from dadiff.behaviours.doubt import Doubted
+from dadiff.behaviours.doubt import ROUNDS, Doubted, DoubtedManifold
 from dadiff.behaviours.known import BoundsChoice, within
-from dadiff.behaviours.least_squares import Offset, Transitions, least_squares, lifted, regressed, significant
+from dadiff.behaviours.least_squares import (
+    Offset,
+    Regression,
+    Transitions,
+    least_squares,
+    lifted,
+    regressed,
+    significant,
+)
 from dadiff.behaviours.lifted import Lifted
 from dadiff.behaviours.limited import Limited
 from dadiff.behaviours.manifold import Manifold
@@ -73,11 +81,14 @@ class Identified(Fitted[Dynamics | Manifold | Limited]):
         data = transitions(layout, sources, self.learn_from)
         notes: dict[str, float] = {"rank": layout.rank}
         if self.features:
-            terms = with_offset(self.features, self.offset)
-            phi = Features(layout.state_dim, layout.input_dim, terms, self.angles)
-            return within(Manifold(layout, regressed(data, phi, self.ridge).system, notes=notes), self.bounds, sources)
+            found = regressed(data, self.phi(layout), self.ridge)
+            return within(Manifold(layout, found.system, notes=notes), self.bounds, sources)
         estimate = least_squares(data, self.offset, sources.offset(self.offset))
         return within(Dynamics(layout, estimate.stages(layout.horizon), notes=notes), self.bounds, sources)
+
+    def phi(self, layout: TrajectoryLayout) -> Features:
+        """The features, with the constant one where an offset is to be carried."""
+        return Features(layout.state_dim, layout.input_dim, with_offset(self.features, self.offset), self.angles)
 
 
 @dataclass(frozen=True)
@@ -101,11 +112,14 @@ class IdentifiedSparse(Identified):
 
     def find(self, layout: TrajectoryLayout, sources: Sources) -> Dynamics | Manifold | Limited:
         """The trajectories of the estimated dynamics; see `Identified.find`."""
-        data = transitions(layout, sources, self.learn_from)
-        phi = Features(layout.state_dim, layout.input_dim, with_offset(self.features, self.offset), self.angles)
-        found = significant(data, phi, self.significance).system
-        terms = float((found.theta != 0).sum(axis=(-2, -1)).mean())
-        return within(Manifold(layout, found, notes={"rank": layout.rank, "terms": terms}), self.bounds, sources)
+        found, notes = self.selected(layout, sources)
+        return within(Manifold(layout, found.system, notes=notes), self.bounds, sources)
+
+    def selected(self, layout: TrajectoryLayout, sources: Sources) -> tuple[Regression, dict[str, float]]:
+        """The dynamics, and the mean number of terms that a robot's have."""
+        found = significant(transitions(layout, sources, self.learn_from), self.phi(layout), self.significance)
+        terms = float((found.system.theta != 0).sum(axis=(-2, -1)).mean())
+        return found, {"rank": layout.rank, "terms": terms}
 
 
 @dataclass(frozen=True)
@@ -114,33 +128,36 @@ class IdentifiedSoft(Identified):
 
     The estimate's posterior covariance says how far a trajectory of the true system may lie from G tau = g, and
     `enforcement=conditional` weighs that against what the denoiser leaves open. With much data it is `Identified`, with
-    little it projects hardly.
+    little it projects hardly. With `features` the dynamics are nonlinear, and so are those of `IdentifiedSparseSoft`.
 
     Args:
         residual: its covariance is that of `each` plan (`dadiff.behaviours.Doubted`), or `averaged` over the
-            demonstrations (`Uncertain`), which long trajectories need.
+            demonstrations (`Uncertain`), which long trajectories of linear dynamics need.
     """
 
     label: ClassVar[str] = "identified_soft"
     residual: Literal["each", "averaged"] = "each"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.features and self.residual == "averaged":
+            raise ConfigError(
+                "projector identified_soft: the residual of nonlinear dynamics is that of each plan; use "
+                "projector.residual=each"
+            )
 
     @property
     def needs(self) -> frozenset[str]:
         """What it learns from; to average, demonstrations, which say what trajectories look like."""
         return super().needs | ({"demonstrations"} if self.residual == "averaged" else set())
 
-    def find(self, layout: TrajectoryLayout, sources: Sources) -> Uncertain | Doubted:
+    def find(self, layout: TrajectoryLayout, sources: Sources) -> Uncertain | Doubted | DoubtedManifold:
         """The estimated dynamics, and the covariance of the residual."""
-        if self.features:
-            raise NotApplicableError(
-                "projector identified_soft: what it trusts is linear dynamics; with features use projector=identified"
-            )
-        if self.bounds == "enforced":
-            raise NotApplicableError(
-                "projector identified_soft: dynamics that are trusted in part are not held within bounds; use "
-                "projector=identified"
-            )
+        check_unbounded(self)
         data = transitions(layout, sources, self.learn_from)
+        if self.features:
+            found = regressed(data, self.phi(layout), self.ridge)
+            return DoubtedManifold(layout, found.system, ROUNDS, root=found.root, notes={"rank": layout.rank})
         estimate = least_squares(data, self.offset, sources.offset(self.offset))
         if self.residual == "each":
             return Doubted(layout, estimate.stages(layout.horizon), estimate.root, notes={"rank": layout.rank})
@@ -148,6 +165,19 @@ class IdentifiedSoft(Identified):
         deviation = float(np.sqrt(np.square(spread).sum(axis=-1).mean()))
         notes = {"rank": layout.rank, "residual_deviation": deviation}
         return Uncertain(layout, estimate.stages(layout.horizon), spread, notes=notes)
+
+
+@dataclass(frozen=True)
+class IdentifiedSparseSoft(IdentifiedSparse):
+    """`IdentifiedSparse`, each of the terms that are kept trusted by how well it is known; see `IdentifiedSoft`."""
+
+    label: ClassVar[str] = "identified_sparse_soft"
+
+    def find(self, layout: TrajectoryLayout, sources: Sources) -> DoubtedManifold:
+        """The estimated dynamics, and the covariance of their terms."""
+        check_unbounded(self)
+        found, notes = self.selected(layout, sources)
+        return DoubtedManifold(layout, found.system, ROUNDS, root=found.root, notes=notes)
 
 
 @dataclass(frozen=True)
@@ -194,6 +224,15 @@ class Koopman(Fitted[Lifted]):
         else:
             K, B = with_constant(*lifted(data.less(c), replace(psi, terms=("identity",)), self.ridge), c)
         return Lifted(layout, psi, K, B, notes={"rank": layout.rank, "observables": psi.count})
+
+
+def check_unbounded(projector: Identified) -> None:
+    """Raise `NotApplicableError` where dynamics that are trusted in part were to be held within bounds."""
+    if projector.bounds == "enforced":
+        raise NotApplicableError(
+            f"projector {projector.label}: dynamics that are trusted in part are not held within bounds; use "
+            f"projector={projector.label.removesuffix('_soft')}"
+        )
 
 
 def transitions(layout: TrajectoryLayout, sources: Sources, learn_from: LearnFrom) -> Transitions:

@@ -105,9 +105,14 @@ class Estimate:
     @property
     def root(self) -> np.ndarray:
         """L of shape (*robots, p, n, p n), with L L' the covariance of [A B c]' = theta, row by row."""
-        S, deviation = np.linalg.cholesky(self.spread), _diagonal(np.sqrt(self.noise))
-        L = S[..., :, None, :, None] * deviation[..., None, :, None, :]
-        return L.reshape(*L.shape[:-2], L.shape[-2] * L.shape[-1])
+        return root_of(np.linalg.cholesky(self.spread), self.noise)
+
+
+def root_of(S: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """L (*robots, p, n, p n) with L L' = S S' (x) diag(noise), from (*robots, p, p) and (*robots, n)."""
+    deviation = _diagonal(np.sqrt(noise))
+    L = S[..., :, None, :, None] * deviation[..., None, :, None, :]
+    return L.reshape(*L.shape[:-2], L.shape[-2] * L.shape[-1])
 
 
 def _diagonal(values: np.ndarray) -> np.ndarray:
@@ -129,9 +134,9 @@ def least_squares(data: Transitions, offset: Offset = "none", known: np.ndarray 
     ones = [np.ones((*data.x.shape[:-1], 1))] if offset == "estimated" else []
     Phi = np.concatenate([data.x, data.u, *ones], axis=-1)
     _check_rank(Phi, n + m)
-    theta, spread, noise = regression(Phi, data.following - given[..., None, :])
+    theta, root, noise = regression(Phi, data.following - given[..., None, :])
     c = theta[..., n + m] if ones else given
-    return Estimate(theta[..., :n], theta[..., n : n + m], c, spread, noise)
+    return Estimate(theta[..., :n], theta[..., n : n + m], c, root @ transposed(root), noise)
 
 
 def regression(Phi: np.ndarray, target: np.ndarray, ridge: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -142,8 +147,8 @@ def regression(Phi: np.ndarray, target: np.ndarray, ridge: float = 0.0) -> tuple
         target: (*robots, count, n).
 
     Returns:
-        theta (*robots, n, p), (Phi' Phi + ridge S^2)^-1 of shape (*robots, p, p), and the residual's variance, p
-        degrees of freedom taken off, (*robots, n).
+        theta (*robots, n, p), a root of (Phi' Phi + ridge S^2)^-1 of shape (*robots, p, p), and the residual's
+        variance, p degrees of freedom taken off, (*robots, n).
     """
     scale = np.sqrt(ridge) * _diagonal(Phi.std(axis=-2))
     rows, right = Phi, target
@@ -153,9 +158,8 @@ def regression(Phi: np.ndarray, target: np.ndarray, ridge: float = 0.0) -> tuple
     Q, R = np.linalg.qr(rows)
     theta = transposed(np.linalg.solve(R, transposed(Q) @ right))
     residual = target - Phi @ transposed(theta)
-    inverse = np.linalg.inv(R)
     freedom = max(Phi.shape[-2] - Phi.shape[-1], 1)
-    return theta, inverse @ transposed(inverse), np.square(residual).sum(axis=-2) / freedom
+    return theta, np.linalg.inv(R), np.square(residual).sum(axis=-2) / freedom
 
 
 @dataclass(frozen=True)
@@ -164,13 +168,11 @@ class Regression:
 
     Args:
         system: with the estimated Theta.
-        spread: (Phi' Phi)^-1, (*robots, p, p).
-        noise: variance of the residual of each state, (*robots, n).
+        root: L of shape (*robots, p, n, k) with L L' the covariance of Theta', row by row.
     """
 
     system: Regressed
-    spread: np.ndarray = field(repr=False)
-    noise: np.ndarray = field(repr=False)
+    root: np.ndarray = field(repr=False)
 
 
 def regressed(data: Transitions, features: Features, ridge: float = 0.0) -> Regression:
@@ -181,8 +183,8 @@ def regressed(data: Transitions, features: Features, ridge: float = 0.0) -> Regr
     """
     Phi = features(data.x, data.u)
     _check_features(Phi, ridge)
-    theta, spread, noise = regression(Phi, data.following - data.x, ridge)
-    return Regression(Regressed(features, theta), spread, noise)
+    theta, root, noise = regression(Phi, data.following - data.x, ridge)
+    return Regression(Regressed(features, theta), root_of(root, noise))
 
 
 def significant(data: Transitions, features: Features, threshold: float) -> Regression:
@@ -195,15 +197,17 @@ def significant(data: Transitions, features: Features, threshold: float) -> Regr
     _check_features(Phi, 0.0)
     lead, p, n = Phi.shape[:-2], Phi.shape[-1], target.shape[-1]
     rows, wanted = Phi.reshape(-1, *Phi.shape[-2:]), target.reshape(-1, *target.shape[-2:])
-    theta, noise = np.zeros((len(rows), n, p)), np.zeros((len(rows), n))
+    theta, roots = np.zeros((len(rows), n, p)), np.zeros((len(rows), p, n, n, p))
     for robot, state in np.ndindex(len(rows), n):
         right = wanted[robot, :, state]
         kept = selected(rows[robot], right, threshold, features.degrees)
         if kept:
-            estimate, _, (noise[robot, state],) = regression(rows[robot][:, kept], right[:, None])
+            estimate, root, noise = regression(rows[robot][:, kept], right[:, None])
             theta[robot, state, kept] = estimate[0]
-    system = Regressed(features, theta.reshape(*lead, n, p))
-    return Regression(system, regression(Phi, target)[1], noise.reshape(*lead, n))
+            roots[robot, kept, state, state, : len(kept)] = root_of(root, noise)[:, 0]
+    root = roots.reshape(*lead, p, n, n * p)
+    moving = root.reshape(-1, n * p).any(axis=0)
+    return Regression(Regressed(features, theta.reshape(*lead, n, p)), root[..., moving])
 
 
 def selected(Phi: np.ndarray, target: np.ndarray, threshold: float, degree: np.ndarray) -> list[int]:
@@ -214,8 +218,8 @@ def selected(Phi: np.ndarray, target: np.ndarray, threshold: float, degree: np.n
     """
     kept = list(range(Phi.shape[-1]))
     while kept:
-        estimate, spread, (noise,) = regression(Phi[:, kept], target[:, None])
-        error = np.sqrt(noise * np.diag(spread)) + ROUNDING * np.abs(estimate).max()
+        estimate, root, (noise,) = regression(Phi[:, kept], target[:, None])
+        error = np.sqrt(noise * np.square(root).sum(axis=-1)) + ROUNDING * np.abs(estimate).max()
         sureness, order = np.abs(estimate[0]) / np.maximum(error, np.finfo(float).tiny), degree[kept]
         unsure = sureness < threshold
         if not unsure.any():

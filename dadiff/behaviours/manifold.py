@@ -101,15 +101,22 @@ class Tracker(Projection):
         """
         check_shape(tau, self._shape)
         if not isinstance(tau, np.ndarray):
-            begin = None if start is None else start.detach().cpu().numpy()
-            return tau.new_tensor(self(tau.detach().cpu().numpy(), metric, begin))
-        where, shape = self._where, tau.shape
-        reference = where.to_physical(tau).reshape(*self._shape[:-1], -1, shape[-1])
-        problem = self._problem(reference, self._identity if metric is None else self._in_physical_units(metric))
-        begin = None if start is None else where.to_physical(start).reshape(reference.shape)
+            given = (None if value is None else value.detach().cpu().numpy() for value in (start, noise))
+            return tau.new_tensor(self(tau.detach().cpu().numpy(), metric, *given))
+        lead = (*self._shape[:-1], -1, tau.shape[-1])
+        given = (None if value is None else value.reshape(lead) for value in (start, noise))
+        return self._project(tau.reshape(lead), metric, *given).reshape(tau.shape)
+
+    def _project(
+        self, z: np.ndarray, metric: Covariance | None, start: np.ndarray | None, noise: np.ndarray | None
+    ) -> np.ndarray:
+        """As `__call__`, of plans (*robots, plans, d) along one dimension."""
+        where, weights = self._where, self._identity if metric is None else self._in_physical_units(metric)
+        problem = self._problem(where.to_physical(z), weights)
+        begin = None if start is None else where.to_physical(start)
         solution = solve(problem, begin, sweeps=self._set.sweeps)
         self.info = self._observed(problem, solution)
-        return where.to_scaled(solution.tau).reshape(shape)
+        return where.to_scaled(solution.tau)
 
     def on(self, device: str) -> Tracker:
         """Itself: it has nothing to move."""
@@ -152,13 +159,16 @@ class Tracker(Projection):
 
 
 def metric_of(covariance: Covariance, layout: TrajectoryLayout, where: Coordinates) -> Metric:
-    """C^-1 in physical units from C in scaled coordinates, by D + U U' with a D that can be inverted."""
+    """C^-1 in physical units from C in scaled coordinates."""
+    spread = invertible(covariance).rescaled(where.scale)
+    return Metric.diagonal(layout, spread.diagonal, spread.factor)
+
+
+def invertible(covariance: Covariance) -> Covariance:
+    """C as D + U U' with a positive D."""
     spread = covariance if covariance.diagonal.all() else covariance.leading(DIRECTIONS)
     variances = spread.diagonal + np.square(spread.factor).sum(axis=-1)
-    least = LEAST * variances.mean()
-    return Metric.diagonal(
-        layout, np.maximum(spread.diagonal, least) * where.scale**2, where.scale[:, None] * spread.factor
-    )
+    return Covariance(np.maximum(spread.diagonal, LEAST * variances.mean()), spread.factor)
 
 
 def _starts_and_others(
