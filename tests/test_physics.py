@@ -15,6 +15,7 @@ from dadiff.datasets import NpzRecordings, NpzTrajectories
 from dadiff.datasets.excitation import check_excited, tell_held
 from dadiff.datasets.physics import mismatch
 from dadiff.errors import DataError, ExcitationError
+from dadiff.store.record import is_odd
 from dadiff.systems import Linear, double_integrator, unknown
 from dadiff.tasks import LQR
 
@@ -57,6 +58,7 @@ HARMED = {
         U,
         r"act \(1, 0\.4\) times as strongly",
     ),
+    "rounded": (np.round(X, 1), U, r"rounded to steps of .0\.1, 0\.1, 0\.1, 0\.1. explain it: record finer"),
     "another model": (
         run(system=replace(SYSTEM, A=SYSTEM.A - 0.1 * np.eye(4)))[0],
         U,
@@ -139,6 +141,8 @@ def test_with_an_offset_estimated_such_data_are_as_good_as_any(harm, tmp_path, c
     np.savez(tmp_path / "a.npz", states=HARMED["trim"][0], inputs=HARMED["trim"][1])
     notes = NpzRecordings(str(tmp_path), offset="estimated").record(SYSTEM).notes
     assert notes["recording_residual"] == pytest.approx(1, abs=0.05)
+    assert notes["offset_residual"] > 2
+    assert is_odd("offset_residual", notes)
     assert "the robot has an offset that the configured system has not, c = [" in caplog.text
 
 

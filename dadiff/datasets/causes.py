@@ -23,9 +23,15 @@ SENTINELS = (-9999.0, -999.0, 9999.0, 999.0)
 MOST_ORDERED, PART = 6, 200
 """States whose orders are all tried, on so many steps."""
 
-FACTORS = [factor for size in (10.0, 100.0, 1000.0, 180 / np.pi) for factor in (size, 1 / size)]
+FACTORS = {0.1: "deci", 0.01: "centi", 1e-3: "milli", 10.0: "deca", 100.0: "hecto", 1e3: "kilo",
+           np.pi / 180: "degrees", 180 / np.pi: "radians"}  # fmt: skip
+"""By what values may have to be multiplied, and what they are in then."""
+
 NOISE = (0.8, 1.3)
 """Ratios that noise leaves."""
+
+ON_A_GRID = 1e-3
+"""By what share of a step values may be off it."""
 
 SAME_STRENGTH = 0.05
 """By how much the strength of an input may differ from 1 and be the same."""
@@ -75,7 +81,7 @@ def cause_of(seen: Seen) -> str:
     """
     if lost := _lost_samples(seen):
         return lost
-    specific = (_offset, _few_steps, _delay, _rate, _order, _units)
+    specific = (_offset, _few_steps, _delay, _rate, _order, _units, _rounded)
     known = (specific, (_strength,), (_units_of_all,), (_own_dynamics,))
     for causes in ((_few_steps,), (_strength,), (_own_dynamics,)) if seen.learned else known:
         found = {word: rest for cause in causes for word, rest in cause(seen).items() if rest < seen.enough}
@@ -161,8 +167,8 @@ def _order(seen: Seen) -> Mapping[str, float]:
 def _units(seen: Seen) -> Mapping[str, float]:
     """A state or an input in units that are 10, 100, 1000 or 57.3 times smaller or larger."""
     states, inputs, found = seen.states, seen.inputs, dict[str, float]()
-    for factor in FACTORS:
-        taken = f"taken {factor:.4g} times fits: other units?"
+    for factor, unit in FACTORS.items():
+        taken = f"taken {factor:.4g} times fits: other units ({unit})?"
         for j in range(states.shape[-1]):
             found[f"state {j} {taken}"] = seen.left(_times(states, j, factor), inputs)
         for j in range(inputs.shape[-1]):
@@ -173,12 +179,30 @@ def _units(seen: Seen) -> Mapping[str, float]:
 def _units_of_all(seen: Seen) -> Mapping[str, float]:
     """All inputs, states or both in such units: said late, since smaller numbers leave less whatever is wrong."""
     states, inputs, found = seen.states, seen.inputs, dict[str, float]()
-    for factor in FACTORS:
-        taken = f"taken {factor:.4g} times fits: other units?"
+    for factor, unit in FACTORS.items():
+        taken = f"taken {factor:.4g} times fits: other units ({unit})?"
         found[f"every input {taken}"] = seen.left(states, factor * inputs)
         found[f"every state {taken}"] = seen.left(factor * states, inputs)
         found[f"everything {taken}"] = seen.left(factor * states, factor * inputs)
     return _as_noise(found)
+
+
+def _rounded(seen: Seen) -> Mapping[str, float]:
+    """States that are written down, or measured, in steps that are coarser than the noise."""
+    values = seen.states.reshape(-1, seen.states.shape[-1])
+    steps = np.array([_step_of(np.unique(column)) for column in values.T])
+    if (steps < seen.scale).all():
+        return {}
+    rest = np.maximum(np.abs(seen.residual) - steps / seen.scale, 0)
+    words = f"states that are rounded to steps of {_listed(steps)} explain it: record finer, or raise process_noise?"
+    return {words: max(_rms(rest), 1.0)}
+
+
+def _step_of(levels: np.ndarray) -> float:
+    """The step of which sorted values are multiples; 0 if there is none."""
+    step = float(np.diff(levels).min(initial=np.inf))
+    counts = levels / step
+    return step if np.isfinite(step) and np.abs(counts - np.round(counts)).max() < ON_A_GRID else 0.0
 
 
 def _strength(seen: Seen) -> Mapping[str, float]:

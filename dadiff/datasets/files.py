@@ -96,14 +96,14 @@ class NpzRecordings:
         """
         _tell_duplicates([(name, x) for name, its in runs.items() for x, _ in its])
         together = [run for its in runs.values() for run in its]
-        plant = plant_of(system, together, robot)
+        plant, notes = plant_of(system, together, robot), dict[str, float]()
         if plant.learned:
             tell_shifted(together, where)
         elif self.offset == "estimated":
-            plant = tell_offset(plant, together, where)
+            plant, notes["offset_residual"] = tell_offset(plant, together, where)
         ratios = [judge_runs(plant, its, name, self.allow_mismatch) for name, its in runs.items()]
         states, inputs = side_by_side(together)
-        notes = {"recording_residual": max(ratios), "inputs_held": float(tell_held([u for _, u in together], where))}
+        notes |= {"recording_residual": max(ratios), "inputs_held": float(tell_held([u for _, u in together], where))}
         if not self.allow_mismatch:
             notes["excitation_condition"] = check_excited(inputs, system.state_dim + 1, where)
         return Recording(states, inputs, notes)

@@ -225,7 +225,7 @@ def _episodes(where: str, runs: list[Run], places: list[int]) -> list[Run]:
     states, inputs = runs[0]
     if sorted(set(places)) != places or not places[0] > 0 or places[-1] > len(states):
         raise DataError(f"{where}: {ENDS} is {places[:6]}; expected rising numbers of rows, at most {len(states)}")
-    starts: list[int] = [0, *(end for end in places if end < len(inputs))]
+    starts = [0, *places[:-1], *(end for end in places[-1:] if end < len(inputs))]
     cut = [(states[a:b], inputs[a : b - 1]) for a, b in pairwise(starts)]
     cut.append((states[starts[-1] :], inputs[starts[-1] :]))
     return [(x, u) for x, u in cut if len(u)]

@@ -165,19 +165,24 @@ def plant_of(system: System, runs: Sequence[Run], robot: int | None = None) -> P
     return Plant.identified(runs) if isinstance(system, Unknown) else Plant.of(system, robot)
 
 
-def tell_offset(plant: Plant, runs: Sequence[Run], where: str) -> Plant:
-    """The plant with the offset that runs show; says so where it is more than noise leaves by chance."""
+def tell_offset(plant: Plant, runs: Sequence[Run], where: str) -> tuple[Plant, float]:
+    """The plant with the offset that runs show, and the ratio of residual to noise without it.
+
+    Says so where the offset is more than noise leaves by chance.
+    """
     r = np.concatenate([plant.residual(x, u) for x, u in runs])
     c, by_chance = r.mean(axis=0), r.std(axis=0) * OFFSET_BY_CHANCE / np.sqrt(len(r))
+    ratio = max(mismatch(plant, x[None], u[None]).ratio for x, u in runs)
     if (np.abs(c) > by_chance).any():
         log.warning(
-            "%s: the robot has an offset that %s has not, c = [%s]: plans are made with it and replayed without; "
-            "give the system its c, or use system=unknown",
+            "%s: the robot has an offset that %s has not, c = [%s]; without it the residual is %.3g times the noise: "
+            "plans are made with the offset and scored without; give the system its c, or use system=unknown",
             where,
             plant.name,
             ", ".join(f"{value:.3g}" for value in c),
+            ratio,
         )
-    return plant.with_offset(runs)
+    return plant.with_offset(runs), ratio
 
 
 def judge(

@@ -89,6 +89,7 @@ METRICS = {
     "prediction_error": "prediction error over T [deviations]",
     "model_cost_ratio": "cost of optima of the model / optimal cost",
     "recording_residual": "residual / noise of the recording",
+    "offset_residual": "residual / noise of the recording without its offset",
     "demonstrations_residual": "residual / noise of the demonstrations",
     "cases_residual": "residual / noise of the test cases",
     "also_in_train": "test cases in train",

@@ -28,6 +28,7 @@ METRICS = {
     "one in a hundred": "plan_latency_p99",
     "deadlines missed": "deadlines_missed",
     "recording / noise": "recording_residual",
+    "without its offset": "offset_residual",
     "demonstrations / noise": "demonstrations_residual",
     "test cases / noise": "cases_residual",
     "test cases in train": "also_in_train",

@@ -89,6 +89,7 @@ MOST_RESIDUAL = 1.5
 
 ABOUT_DATA = {
     "recording_residual": "the recording's steps are {:.3g} times their noise off the system's",
+    "offset_residual": "the recording's offset is none of the system's, whose steps are {:.3g} times their noise off",
     "demonstrations_residual": "the demonstrations' steps are {:.3g} times their noise off the system's",
     "cases_residual": "the test cases' steps are {:.3g} times their noise off the system's",
     "also_in_train": "{:.0f} test cases are also in train",
