@@ -69,6 +69,15 @@ def test_leading_directions_are_kept_and_the_others_become_a_diagonal():
     np.testing.assert_allclose(diagonal.matrix, np.diag(np.diag(C.matrix)), atol=1e-12)
 
 
+def test_an_invertible_form_has_a_diagonal_keeps_the_variances_and_is_found_once(rng):
+    C = Covariance.dense(np.cov(rng.standard_normal((40, 200))))
+    assert C.invertible is C.invertible
+    assert C.invertible.diagonal.min() > 0
+    np.testing.assert_allclose(np.diag(C.invertible.matrix), np.diag(C.matrix), rtol=1e-9)
+    certain = Covariance.diagonal_of(np.array([0.0, 1.0]))
+    assert 0 < certain.invertible.diagonal[0] < 1e-5
+
+
 def test_certain_entries_that_are_given_move_nothing():
     C = Covariance(np.array([0.0, 1, 1]), np.zeros((3, 0)))
     left, gain = C.given([0])

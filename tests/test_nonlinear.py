@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from dadiff.errors import ConfigError, ShapeError
-from dadiff.systems.nonlinear import Nonlinear, Simulated
+from dadiff.systems.nonlinear import Continuous, Nonlinear, Simulated
 from dadiff.systems.quadrotors import GRAVITY, PlanarQuadrotor
 
 QUADROTORS = PlanarQuadrotor(
@@ -89,3 +89,10 @@ def test_what_cannot_be_is_refused():
         PlanarQuadrotor(time_step=None)
     with pytest.raises(ConfigError, match="difference is 0"):
         Simulated(lambda x, u: x, 2, 1, difference=0.0)
+
+
+@pytest.mark.parametrize("system", [QUADROTORS, SINGLE], ids=["robots", "single"])
+@pytest.mark.parametrize("plans", [(), (4,), (4, 5)])
+def test_steps_in_machine_code_are_those_of_the_integrator(system, plans, rng):
+    x, u = (rng.standard_normal((*system.robots, *plans, size)) for size in (6, 2))
+    np.testing.assert_allclose(system.step(x, u), Continuous.step(system, x, u), rtol=1e-13, atol=1e-13)

@@ -18,7 +18,7 @@ from functools import partial
 import numpy as np
 
 from dadiff.behaviours.forms import Blocks, Hold, Rows
-from dadiff.behaviours.manifold import Manifold, Tracker, invertible
+from dadiff.behaviours.manifold import Manifold, Tracker
 from dadiff.behaviours.pins import Pin, Pinned
 from dadiff.behaviours.projection import Geometry
 from dadiff.behaviours.sets import Dynamics, identity
@@ -193,7 +193,7 @@ class DoubtedTracker(Tracker):
     def _project(
         self, z: np.ndarray, metric: Covariance | None, start: np.ndarray | None, noise: np.ndarray | None
     ) -> np.ndarray:
-        C = invertible(metric or identity(self._set.layout))
+        C = (metric or identity(self._set.layout)).invertible
         values = np.broadcast_to(self._pinned.values, (*z.shape[:-1], len(self._pinned.places)))
         hold = Hold.of(C, self._pinned.places, self._where)
         about = hold.pin(self._where.to_physical(z if start is None else start), values)

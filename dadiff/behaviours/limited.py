@@ -14,7 +14,7 @@ from typing import cast
 
 import numpy as np
 
-from dadiff.behaviours.manifold import LEAST, Manifold
+from dadiff.behaviours.manifold import Manifold
 from dadiff.behaviours.pins import Pin, Pinned
 from dadiff.behaviours.projection import Projection, ProjectionInfo, check_shape
 from dadiff.behaviours.sets import Dynamics
@@ -24,7 +24,7 @@ from dadiff.experts.nearest import Limits, Status, compile_kernels, nearest, wit
 from dadiff.systems.system import Bounds
 from dadiff.trajectory.arrays import Array
 from dadiff.trajectory.coordinates import Coordinates, physical
-from dadiff.trajectory.covariance import Covariance
+from dadiff.trajectory.covariance import LEAST, Covariance
 from dadiff.trajectory.layout import Layout, TrajectoryLayout
 
 

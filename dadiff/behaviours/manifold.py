@@ -25,12 +25,6 @@ from dadiff.trajectory.coordinates import Coordinates, physical
 from dadiff.trajectory.covariance import Covariance
 from dadiff.trajectory.layout import TrajectoryLayout
 
-DIRECTIONS = 20
-"""Directions of a covariance without a diagonal that are kept; the variances of the others go to its diagonal."""
-
-LEAST = 1e-6
-"""Of the mean variance: what an entry is given on the diagonal where a covariance takes it for certain."""
-
 
 @dataclass(frozen=True)
 class Manifold:
@@ -160,15 +154,8 @@ class Tracker(Projection):
 
 def metric_of(covariance: Covariance, layout: TrajectoryLayout, where: Coordinates) -> Metric:
     """C^-1 in physical units from C in scaled coordinates."""
-    spread = invertible(covariance).rescaled(where.scale)
+    spread = covariance.invertible.rescaled(where.scale)
     return Metric.diagonal(layout, spread.diagonal, spread.factor)
-
-
-def invertible(covariance: Covariance) -> Covariance:
-    """C as D + U U' with a positive D."""
-    spread = covariance if covariance.diagonal.all() else covariance.leading(DIRECTIONS)
-    variances = spread.diagonal + np.square(spread.factor).sum(axis=-1)
-    return Covariance(np.maximum(spread.diagonal, LEAST * variances.mean()), spread.factor)
 
 
 def _starts_and_others(

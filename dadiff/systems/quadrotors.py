@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
 
 from dadiff.errors import ConfigError
 from dadiff.systems.families import Family, Ranges, Robots
-from dadiff.systems.nonlinear import Continuous
-from dadiff.systems.system import Bounds, Limits, turned
+from dadiff.systems.nonlinear import STAGES, Continuous
+from dadiff.systems.system import Bounds, Limits, Times, turned
 
 GRAVITY = 9.81  # m/s^2
 ROTORS_AND_BEAM = 0.1 * np.array([[-4, 1], [-2, 1], [-3, 1], [-3, 0], [3, 0], [3, 1], [2, 1], [4, 1]])  # m
@@ -53,6 +54,23 @@ class PlanarQuadrotor(Continuous):
     def robots(self) -> tuple[int, ...]:
         """(R,) where parameters are arrays."""
         return np.shape(self.thrust_gain)
+
+    def step(self, x: np.ndarray, u: np.ndarray, t: Times = 0) -> np.ndarray:
+        """As `Continuous.step`, in machine code."""
+        from dadiff.systems.quadrotor_steps import steps
+
+        flat = (len(self._each), -1)
+        return steps(x.reshape(*flat, 6), u.reshape(*flat, 2), self._each, GRAVITY, self._stages).reshape(x.shape)
+
+    @cached_property
+    def _each(self) -> np.ndarray:
+        """a, b and c of each robot, (R, 3); one row for a single system."""
+        return np.stack(np.broadcast_arrays(*np.atleast_1d(self.thrust_gain, self.torque_gain, self.drag)), -1) * 1.0
+
+    @cached_property
+    def _stages(self) -> np.ndarray:
+        """Of the integrator: shares and weights, (S, 2), in seconds."""
+        return (self.time_step or 0.0) * np.array(STAGES[self.integrator])
 
     def derivative(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
         """dx/dt, see the class."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -15,6 +16,12 @@ from dadiff.errors import ConfigError, ShapeError
 from dadiff.trajectory.arrays import Array
 from dadiff.trajectory.response import along
 from dadiff.trajectory.subspace import semidefinite_root
+
+DIRECTIONS = 20
+"""Directions of a covariance without a diagonal that are kept; the variances of the others go to its diagonal."""
+
+LEAST = 1e-6
+"""Of the mean variance: what an entry is given on the diagonal where a covariance takes it for certain."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +91,16 @@ class Covariance:
     def leading(self, count: int) -> Covariance:
         """The `count` leading directions of C, and of the others the variances alone; see `of_spectrum`."""
         return Covariance.of_spectrum(*np.linalg.eigh(self.matrix), count)
+
+    @cached_property
+    def invertible(self) -> Covariance:
+        """C as D + U U' with a positive D: itself, or its DIRECTIONS leading ones; found once.
+
+        Entries that it takes for certain are given LEAST of the mean variance.
+        """
+        spread = self if self.diagonal.all() else self.leading(DIRECTIONS)
+        variances = spread.diagonal + np.square(spread.factor).sum(axis=-1)
+        return Covariance(np.maximum(spread.diagonal, LEAST * variances.mean()), spread.factor)
 
     @classmethod
     def of_spectrum(cls, values: np.ndarray, vectors: np.ndarray, count: int) -> Covariance:
