@@ -12,7 +12,7 @@ from safetensors.torch import save_file
 
 from dadiff.denoisers import MLP, EncoderDecoder, Gaussian
 from dadiff.denoisers.checkpoints import load, save, write
-from dadiff.denoisers.exact import ExactDenoiser
+from dadiff.denoisers.exact import ExactDenoiser, Smoother
 from dadiff.denoisers.learned import CHUNK, NetworkDenoiser
 from dadiff.denoisers.prediction import loss_weights, prediction
 from dadiff.denoisers.recipes import Recipe
@@ -136,6 +136,40 @@ def test_exact_denoiser_of_the_lqr_law():
     dense = conditional_mean(law, physical(layout), schedule.alpha_bar[7], z.numpy(), E.numpy())
     np.testing.assert_allclose(denoiser(z, 7, E), dense, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(denoiser(z, 7, E)[:4], E[:4], atol=1e-12)
+
+
+def closed_loop(*robots: int) -> tuple[ClosedLoopLaw, TrajectoryLayout, Coordinates]:
+    """An offset, noise of its own in each state but one, and any coordinates."""
+    rng, n, m = numpy_generator(5, "closed loop"), 4, 2
+    A, B, c = (rng.standard_normal((*robots, n, k)) for k in (n, m, 1))
+    noise = np.array([0.1, 0.5, 0.0, 0.3])
+    system = Linear(0.4 * A, B, c[..., 0], process_noise=noise, robots=robots[0] if robots else None)
+    law, layout = ClosedLoopLaw(system, optimal_feedback(system, np.eye(n), np.eye(m), 7)), system.layout(7)
+    return law, layout, Coordinates(rng.standard_normal(layout.size), rng.uniform(0.3, 3, layout.size))
+
+
+@pytest.mark.parametrize("robots", [(), (3,)], ids=["one", "fleet"])
+def test_the_smoother_is_the_exact_denoiser(monkeypatch, robots):
+    law, layout, c = closed_loop(*robots)
+    schedule = Schedule(np.array([0.0, 0.02, 0.3, 0.9, 1.0]))
+    dense = Gaussian().exact(law, c, schedule)
+    monkeypatch.setattr("dadiff.experts.lqr.DENSE_UP_TO", 10)
+    smoother = Gaussian().exact(law, c, schedule)
+    assert (type(dense), type(smoother)) == (ExactDenoiser, Smoother)
+    z, E = draw(*robots, 2, 3, layout.size), draw(*robots, 2, 3, 8, seed=1)
+    for i in range(1, 5):
+        torch.testing.assert_close(smoother(z, i, E), dense(z, i, E), rtol=1e-10, atol=1e-10)
+
+
+def test_the_smoother_has_the_gradient_of_the_exact_denoiser(monkeypatch):
+    law, layout, c = closed_loop()
+    dense, gradients = Gaussian().exact(law, c, paper_linear()), []
+    monkeypatch.setattr("dadiff.experts.lqr.DENSE_UP_TO", 10)
+    for denoiser in (dense, Gaussian().exact(law, c, paper_linear())):
+        z = draw(layout.size).requires_grad_()
+        denoiser.estimate(z, 20, draw(8, seed=1)).square().sum().backward()
+        gradients.append(z.grad)
+    torch.testing.assert_close(*gradients, rtol=1e-9, atol=1e-9)
 
 
 def test_exact_denoiser_in_the_limits():

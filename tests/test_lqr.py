@@ -19,7 +19,6 @@ from dadiff.randomness import numpy_generator
 from dadiff.systems import AffineSystem, Bounds, DampedIntegrators, Linear, double_integrator
 from dadiff.tasks import LQR, Fleet
 from dadiff.tasks.obstacles import Obstacles
-from dadiff.trajectory.response import along
 
 
 def task_for(system: Linear, horizon: int = 12, **options) -> LQR:
@@ -150,14 +149,16 @@ def test_the_mean_is_the_closed_loop_without_noise(affine):
     np.testing.assert_allclose(followed, tau, atol=1e-10)
 
 
-def test_the_law_is_the_closed_loop_under_noise(affine, rng):
-    """Entry by entry: unit noise through `noise_map` is w through the closed loop."""
+def test_the_law_is_the_closed_loop_under_noise(monkeypatch, affine, rng):
+    """Entry by entry: unit noise through `noise_map`, or along time, is w through the closed loop."""
     task = task_for(affine)
     law, E = task.law(affine), rng.standard_normal((5, 2 * affine.state_dim))
     unit = rng.standard_normal((5, task.horizon, affine.state_dim))
     ends = task.condition(affine).unpack(E)
     noisy = follow(affine, task.feedback(affine), ends["x_init"], ends["target"], affine.process_noise * unit)
-    np.testing.assert_allclose(law.mean(E) + along(law.noise_map, unit.reshape(5, -1)), noisy, atol=1e-10)
+    for dense_up_to in (2000, 10):
+        monkeypatch.setattr("dadiff.experts.lqr.DENSE_UP_TO", dense_up_to)
+        np.testing.assert_allclose(law.mean(E) + law.spread(unit.reshape(5, -1)), noisy, atol=1e-10)
 
 
 def test_a_plan_of_the_expert_is_its_replay(affine):

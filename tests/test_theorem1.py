@@ -20,7 +20,7 @@ from dadiff.diffusion.chain import Samples, sample
 from dadiff.diffusion.enforcement import Literally, Never, Normalised
 from dadiff.diffusion.samplers import DDPM
 from dadiff.diffusion.schedule import paper_linear
-from dadiff.evaluation.mahalanobis import MahalanobisDistance
+from dadiff.evaluation.mahalanobis import ClosedLoopDistance, MahalanobisDistance, distance_to
 from dadiff.evaluation.records import ChainRecorder
 from dadiff.randomness import numpy_generator, torch_generator
 from dadiff.tasks import LQR
@@ -64,6 +64,19 @@ def test_draws_of_the_law_lie_on_its_support_at_a_chi_square_distance(distance, 
     assert freedom == law.noise_map.shape[-1]
     np.testing.assert_allclose(on.mean(), freedom, atol=5 * np.sqrt(2 * freedom / len(on)))
     np.testing.assert_allclose(off, 0, atol=1e-20)
+
+
+def test_the_distance_along_time_is_the_dense_one(monkeypatch, system, rng):
+    task = LQR(horizon=6, state_cost=(1.0,) * system.state_dim)
+    environment = task.sample_environments(system, (20,), rng)
+    law = task.law(system)
+    dense = distance_to(law, environment)
+    monkeypatch.setattr("dadiff.experts.lqr.DENSE_UP_TO", 10)
+    recursive = distance_to(law, environment)
+    assert (type(dense), type(recursive)) == (MahalanobisDistance, ClosedLoopDistance)
+    tau = law.mean(environment) + rng.standard_normal((20, len(law.mean_map)))
+    for one, other in zip(dense(tau), recursive(tau), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-6)
 
 
 @cache

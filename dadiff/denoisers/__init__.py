@@ -5,7 +5,7 @@
     networks.py     the networks
     learned.py      `NetworkDenoiser`: network, prediction, scaling of E; the casts between float64 and float32
     encoded.py      `EncodedDenoiser`: a network that is told features of E and predicts the difference to a reference
-    exact.py        `ExactDenoiser`: the posterior mean of a Gaussian law
+    exact.py        `ExactDenoiser`: the posterior mean of a Gaussian law; `Smoother`: of a closed loop's, in O(T)
     training.py     `Training`: the component; light, without torch
     learning.py     `train`: the loop, its interruption and resumption
     checkpoints.py  files of weights: safetensors with a typed description

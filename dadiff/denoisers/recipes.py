@@ -14,7 +14,7 @@ from dadiff.trajectory import Layout, TrajectoryLayout
 if TYPE_CHECKING:
     import torch
 
-    from dadiff.denoisers.exact import ExactDenoiser, Law
+    from dadiff.denoisers.exact import Law, PosteriorMean
     from dadiff.denoisers.learned import NetworkDenoiser
     from dadiff.trajectory.coordinates import Coordinates
 
@@ -51,7 +51,7 @@ class ExactRecipe(Protocol):
     trainable: ClassVar[bool]
     matched: ClassVar[bool]
 
-    def exact(self, law: Law, coordinates: Coordinates, schedule: Schedule, device: str = "cpu") -> ExactDenoiser:
+    def exact(self, law: Law, coordinates: Coordinates, schedule: Schedule, device: str = "cpu") -> PosteriorMean:
         """The denoiser for the law of the clean trajectories."""
         ...
 
@@ -210,11 +210,11 @@ class Gaussian:
     trainable: ClassVar[bool] = False
     matched: ClassVar[bool] = False
 
-    def exact(self, law: Law, coordinates: Coordinates, schedule: Schedule, device: str = "cpu") -> ExactDenoiser:
+    def exact(self, law: Law, coordinates: Coordinates, schedule: Schedule, device: str = "cpu") -> PosteriorMean:
         """The denoiser of one law, in the coordinates in which the sampler works."""
-        from dadiff.denoisers.exact import ExactDenoiser
+        from dadiff.denoisers.exact import ExactParts
 
-        return ExactDenoiser(law, coordinates, schedule, device)
+        return ExactParts(law, coordinates, schedule).build(device)
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from dadiff.experts.lqr import GaussianLaw
+from dadiff.experts.lqr import ClosedLoopLaw, GaussianLaw
 from dadiff.trajectory.subspace import rank_tolerance
 
 
@@ -41,3 +41,35 @@ class MahalanobisDistance:
         along = deviation @ self.support
         off = deviation - along @ self.support.T
         return np.square(along / self.deviations).sum(-1), np.square(off).sum(-1)
+
+
+@dataclass(frozen=True)
+class ClosedLoopDistance:
+    """The same to the law of one closed loop with noise in every state, in O(T).
+
+    About the mean its support is x(0) = 0, u(t) = K(t) x(t). The nearest point of it is x(t) = (I + K'K)^-1 (x + K'u),
+    step by step, and its distance sum_t |w(t) / sigma|^2 of the w that leads along it.
+    """
+
+    law: ClosedLoopLaw
+    mean: np.ndarray = field(repr=False)
+
+    def __call__(self, tau: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """See `MahalanobisDistance.__call__`."""
+        K, closed = self.law.feedback.K, self.law.closed
+        x, u = self.law.system.layout(self.law.feedback.horizon).split(tau - self.mean)
+        nearest = x.copy()
+        along = x[:, :-1] + np.einsum("tmn,ktm->ktn", K, u)
+        nearest[:, :-1] = np.linalg.solve(np.eye(x.shape[-1]) + K.mT @ K, along[..., None])[..., 0]
+        nearest[:, 0] = 0
+        w = nearest[:, 1:] - np.einsum("tij,ktj->kti", closed, nearest[:, :-1])
+        off = np.square(nearest - x).sum((-2, -1))
+        off += np.square(np.einsum("tmn,ktn->ktm", K, nearest[:, :-1]) - u).sum((-2, -1))
+        return np.square(w / self.law.deviations).sum((-2, -1)), off
+
+
+def distance_to(law: GaussianLaw, environment: np.ndarray) -> MahalanobisDistance | ClosedLoopDistance:
+    """The distance to the law given E (plans, c), in the form that suits its size."""
+    if isinstance(law, ClosedLoopLaw) and law.is_long and (law.deviations > 0).all():
+        return ClosedLoopDistance(law, law.mean(environment))
+    return MahalanobisDistance.of(law, environment)

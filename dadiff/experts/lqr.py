@@ -12,6 +12,7 @@ Systems may have a robot dimension; everything is vectorised over it.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -19,6 +20,9 @@ from dadiff.errors import ConfigError, InfeasibleError
 from dadiff.systems import AffineSystem, Linear
 from dadiff.trajectory.response import along, beside
 from dadiff.trajectory.subspace import regression
+
+DENSE_UP_TO = 2000
+"""The size d of trajectories up to which dense maps are faster than recursions along time."""
 
 
 @dataclass(frozen=True)
@@ -77,6 +81,10 @@ class GaussianLaw:
     def mean(self, ends: np.ndarray) -> np.ndarray:
         """The mean (*robots, ..., d) given [x_init; x_target] (*robots, ..., 2n)."""
         return along(self.mean_map, ends) + beside(self.offset, ends)
+
+    def spread(self, unit: np.ndarray) -> np.ndarray:
+        """What unit noise (*robots, ..., k) adds to the mean, (*robots, ..., d)."""
+        return along(self.noise_map, unit)
 
     @property
     def covariance(self) -> np.ndarray:
@@ -162,6 +170,34 @@ class ClosedLoopLaw(GaussianLaw):
         found = {"mean_map": maps[..., :n], "offset": follow(self.system, self.feedback, ends, ends)}
         for name, array in {**found, "noise_map": maps[..., n:]}.items():
             object.__setattr__(self, name, array)
+
+    @property
+    def is_long(self) -> bool:
+        """Whether recursions along time serve better than the maps."""
+        return self.mean_map.shape[-2] > DENSE_UP_TO
+
+    @cached_property
+    def closed(self) -> np.ndarray:
+        """A_t + B_t K(t) of shape (*robots, T, n, n): about its mean the law is x(t+1) = closed x(t) + sigma w(t)."""
+        A, B, _ = self.system.matrices(self.feedback.horizon)
+        return A + B @ self.feedback.K
+
+    @property
+    def deviations(self) -> np.ndarray:
+        """sigma, of every state's process noise, (n,)."""
+        return np.broadcast_to(self.system.process_noise, self.system.state_dim)
+
+    def spread(self, unit: np.ndarray) -> np.ndarray:
+        """See `GaussianLaw.spread`; in O(T) where that is long."""
+        if not self.is_long:
+            return super().spread(unit)
+        T, n = self.feedback.horizon, self.system.state_dim
+        w = self.deviations * unit.reshape(*unit.shape[:-1], T, n)
+        states, inputs = np.zeros((*unit.shape[:-1], T + 1, n)), np.empty((*unit.shape[:-1], T, self.system.input_dim))
+        for t in range(T):
+            inputs[..., t, :] = along(self.feedback.K[..., t, :, :], states[..., t, :])
+            states[..., t + 1, :] = along(self.closed[..., t, :, :], states[..., t, :]) + w[..., t, :]
+        return self.system.layout(T).flatten(states, inputs)
 
 
 def _propagated(system: AffineSystem, feedback: AffineFeedback) -> np.ndarray:

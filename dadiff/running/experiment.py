@@ -24,7 +24,7 @@ from dadiff.errors import NotApplicableError
 from dadiff.evaluation import ClosedLoop, Exact, planned_errors, replay, spread, tracking_errors, violations
 from dadiff.evaluation.closed_loop import Bench, latencies, means
 from dadiff.evaluation.likeness import likeness
-from dadiff.evaluation.mahalanobis import MahalanobisDistance
+from dadiff.evaluation.mahalanobis import distance_to
 from dadiff.evaluation.records import ChainRecorder, Snapshots, headline, merged, tables
 from dadiff.exact import Exactness, exactness, sampled_exactness
 from dadiff.outside import passwords_removed
@@ -184,7 +184,7 @@ def _observers(experiment: Experiment, environment: np.ndarray) -> tuple[ChainRe
     if parts.denoiser.trainable or environment.ndim > 2 or not parts.evaluation.theorem1:
         return None, snapshots
     followed = np.arange(0, len(environment), parts.evaluation.samples)
-    distance = MahalanobisDistance.of(experiment.law, environment[followed])
+    distance = distance_to(experiment.law, environment[followed])
     return ChainRecorder(distance, followed, experiment.coordinates.to_physical), snapshots
 
 

@@ -186,7 +186,7 @@ class LQR:
             return self._realise_within(system, environment, rng)
         law = self.law(system)
         noise = rng.standard_normal((*environment.shape[:-1], law.noise_map.shape[-1]))
-        return law.mean(environment) + along(law.noise_map, noise)
+        return law.mean(environment) + law.spread(noise)
 
     def solve(
         self,
