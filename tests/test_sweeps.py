@@ -60,6 +60,7 @@ def configs(root: Path, cells: Sequence[Sequence[str]] = CELLS) -> list[dict]:
 def run_here(run: SweepRun) -> dict[str, Outcome]:
     """Do the sweep's work in this process, as the launcher's pool does it in others."""
     cells = {cell.identity.key: cell for cell in run.plan.cells}
+    run.begin()
     parent, outcomes = run.open(), {}
     for work in run.works():
         try:

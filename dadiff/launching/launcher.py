@@ -9,7 +9,6 @@ from abc import abstractmethod
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from functools import partial
 from types import FrameType
 from typing import Any
 
@@ -89,9 +88,9 @@ class SweepLauncher(Launcher):
         """Run what is to be run; returns the exit code."""
         skipped = len(run.plan.cells) - len(run.plan.waiting)
         pool = self.pool(run, lease) if run.plan.waiting else None
-        parent = run.open()
+        run.begin()
         works = run.works()
-        watch = Watch(run, parent, Table(sys.stderr, works, skipped))
+        watch = Watch(run, Table(sys.stderr, works, skipped))
         interrupted = False
         if skipped:
             sys.stderr.write(_said_of_done(skipped, len(run.plan.cells)))
@@ -120,17 +119,13 @@ def _said_of_done(done: int, total: int) -> str:
 
 
 class Watch:
-    """Follows a sweep's work: draws it, records failures at once, mirrors what ended beside the work that goes on.
+    """Follows a sweep's work: draws it, records failures at once; beside it a thread opens and feeds MLflow."""
 
-    Args:
-        parent: the MLflow run of the sweep.
-    """
-
-    def __init__(self, run: SweepRun, parent: str | None, table: Table) -> None:
+    def __init__(self, run: SweepRun, table: Table) -> None:
         self.table, self.outcomes = table, dict[str, Outcome]()
         self._run, self._cells = run, {cell.identity.key: cell for cell in run.plan.cells}
-        self._mirror = partial(run.mirror, parent=parent)
         self._uploads, self._uploader = list[Future[None]](), ThreadPoolExecutor(1, "mlflow")
+        self._parent = self._uploader.submit(run.open)
 
     def ended(self, work: Work, outcome: Outcome) -> None:
         """Work ended."""
@@ -139,6 +134,9 @@ class Watch:
         if work.key in self._cells:
             self._run.ended(self._cells[work.key], outcome)
         self._uploads.append(self._uploader.submit(self._mirror, work.key))
+
+    def _mirror(self, key: str) -> None:
+        self._run.mirror(key, self._parent.result())
 
     def tick(self, running: Sequence[Running]) -> None:
         """Time has passed."""

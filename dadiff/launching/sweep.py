@@ -1,6 +1,6 @@
 """A multirun from its configurations to its summary, whatever runs its jobs.
 
-plan -> MLflow's store -> sweep.json and its mirror -> jobs, each mirrored as it ends -> sweep.json, mirror, summary
+plan -> sweep.json -> jobs; beside them MLflow's store, the sweep's mirror, and that of each as it ends -> summary
 """
 
 from __future__ import annotations
@@ -54,15 +54,25 @@ class SweepRun:
         """Where the sweep's record and logs lie."""
         return Sweeps(self.output_dir).folder(self.name)
 
-    def open(self) -> str | None:
-        """Write the sweep's record and mirror it. Returns the MLflow run that its runs are nested under.
+    def begin(self) -> None:
+        """Write the sweep's record, if MLflow's store is not to be refused.
 
         Raises:
             StoreError: if results cannot be written or the MLflow store is away.
         """
-        self.tracking.prepare()
+        self.tracking.look()
         Sweeps(self.output_dir).write(self.record(self.cells()))
-        return self.tracking.log_sweep(self.output_dir, self.name)
+
+    def open(self) -> str | None:
+        """Make MLflow's store, which takes seconds, and mirror the sweep's record.
+
+        Returns:
+            The MLflow run that its runs are nested under.
+        """
+        with spared(self.name):
+            self.tracking.prepare()
+            return self.tracking.log_sweep(self.output_dir, self.name)
+        return None
 
     def is_told(self) -> bool:
         """Whether all is done, recorded and mirrored as this start of the sweep would do it, so that nothing is left.

@@ -22,6 +22,8 @@ from dadiff.folders import shipped
 from dadiff.running.digest import digest
 
 Node = Mapping[str, Any]
+SAFE = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+"""In C where it was compiled: every job reads the presets."""
 
 FIRST = ("task", "projector", "recording", "enforcement", "encoding", "denoiser", "sampler")
 """Groups that every name shows, as far as they matter; others where they are not what the task usually has."""
@@ -119,7 +121,8 @@ def _presets(group: str) -> dict[str, dict[str, dict[str, Any]]]:
     """Class -> the shipped presets that name it themselves -> their parameters."""
     found: dict[str, dict[str, dict[str, Any]]] = {}
     for file in sorted((shipped("conf") / group).glob("*.yaml")):
-        node = _read(file)[0].get(group, _read(file)[0])
+        content, _ = _read(file)
+        node = content.get(group, content)
         if TARGET in node:
             found.setdefault(node[TARGET], {})[file.stem] = {k: v for k, v in node.items() if k != TARGET}
     return found
@@ -127,7 +130,7 @@ def _presets(group: str) -> dict[str, dict[str, dict[str, Any]]]:
 
 def _read(file: Path) -> tuple[dict[str, Any], Sequence[Any]]:
     """A preset's content and its list of defaults."""
-    content = yaml.safe_load(file.read_text())
+    content = yaml.load(file.read_text(), Loader=SAFE)
     return content, content.pop("defaults", [])
 
 

@@ -2,7 +2,7 @@
 
 MLflow makes its tables in many steps, and a process that is killed between two of them, or a second one that comes
 meanwhile, breaks the file for good. So it is made beside its place and renamed. As all that it holds is a mirror of
-what lies in the output folder, a damaged one is set aside, and filled again.
+what lies in the output folder, a damaged one is set aside, and filled again, and nobody waits for the disk.
 """
 
 from __future__ import annotations
@@ -10,10 +10,12 @@ from __future__ import annotations
 import logging
 import sqlite3
 from contextlib import closing
+from functools import cache
 from pathlib import Path
+from typing import Literal
 
 from dadiff.errors import StoreError
-from dadiff.store.files import make_folder
+from dadiff.store.files import make_folder, sync
 from dadiff.tracking.places import SQLITE, address_of, artifacts_of, folder_of
 
 HEADER = b"SQLite format 3\0"
@@ -39,6 +41,7 @@ def prepare_database(path: Path, experiment: str, artifacts: str | None) -> None
     if not path.exists():
         _create(path)
     _write_ahead(path)
+    _unhurried(address_of(SQLITE + str(path)), "NORMAL")
 
 
 def damage_of(path: Path, experiment: str, artifacts: str | None) -> str | None:
@@ -92,12 +95,27 @@ def _create(path: Path) -> None:
     for left in path.parent.glob(f".{path.name}.making*"):
         left.unlink()
     making = path.with_name(f".{path.name}.making")
-    SqlAlchemyStore(address_of(SQLITE + str(making)), artifacts_of(path.parent / "mlartifacts")).engine.dispose()
+    address = address_of(SQLITE + str(making))
+    _unhurried(address, "OFF")
+    SqlAlchemyStore(address, artifacts_of(path.parent / "mlartifacts")).engine.dispose()
+    sync(making)
     shared = path.parent.stat().st_mode & 0o060  # SQLite gives no rights to a group, whatever the umask
     making.chmod(making.stat().st_mode | shared)
     making.rename(path)
     here = address_of(SQLITE + str(path))
     SqlAlchemyStore._get_or_create_engine(here).dispose()  # connections of this process to what lay here
+
+
+@cache
+def _unhurried(address: str, level: Literal["OFF", "NORMAL"]) -> None:
+    """How far MLflow's connections in this process wait for the disk: never, or when the write-ahead log is emptied."""
+    from mlflow.store.tracking.sqlalchemy_store import SqlAlchemyStore
+    from sqlalchemy import event
+
+    def set_up(connection: sqlite3.Connection, record: object) -> None:
+        connection.execute(f"PRAGMA synchronous={level}")
+
+    event.listen(SqlAlchemyStore._get_or_create_engine(address), "connect", set_up)
 
 
 def _write_ahead(path: Path) -> None:

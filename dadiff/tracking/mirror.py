@@ -12,6 +12,7 @@ import platform
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
     from mlflow.entities import DatasetInput, Run
 
 CONTEXT = "mlflow.data.context"
-METRICS_AT_ONCE, PARAMS_AT_ONCE = 1000, 100  # that MLflow takes
+METRICS_AT_ONCE, PARAMS_AT_ONCE, TAGS_AT_ONCE = 800, 100, 100  # that MLflow takes, of all together 1000
 
 
 class Mirror:
@@ -121,11 +122,10 @@ def log_content(client: MlflowClient, run_id: str, content: Content) -> None:
 
     metrics = [Metric(name, value, content.time, step) for name, value, step in content.metrics]
     params = [Param(name, value) for name, value in content.params.items()]
-    for batch in chunks(metrics, METRICS_AT_ONCE):
-        client.log_batch(run_id, metrics=batch)
-    for batch in chunks(params, PARAMS_AT_ONCE):
-        client.log_batch(run_id, params=batch)
-    client.log_batch(run_id, tags=[RunTag(name, value) for name, value in content.tags.items()])
+    tags = [RunTag(name, value) for name, value in content.tags.items()]
+    parts = chunks(metrics, METRICS_AT_ONCE), chunks(params, PARAMS_AT_ONCE), chunks(tags, TAGS_AT_ONCE)
+    for batch in zip_longest(*parts, fillvalue=()):
+        client.log_batch(run_id, *batch)
     if content.inputs:
         client.log_inputs(run_id, [_dataset(data) for data in content.inputs])
     for key, picture in content.images.items():

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from dadiff.errors import ConfigError
 from dadiff.outside import without_passwords
 from dadiff.store import StoredRun, Sweep, Sweeps, store_id
+from dadiff.store.files import make_folder
 from dadiff.tracking.client import open_client, prepare_store, spared
 from dadiff.tracking.content import Piece, run_piece, sweep_piece, training_piece
 from dadiff.tracking.database import damage_of
@@ -67,8 +68,20 @@ class Tracking:
             given["artifacts"] = str(Path(uri.removeprefix(SQLITE)).absolute().parent / "mlartifacts")
         return cls(**given | ({} if uri is None else {"uri": uri}))
 
+    def look(self) -> None:
+        """Refuse a store before anything runs; one that is a file is looked at without MLflow, and made by `prepare`.
+
+        Raises:
+            StoreError: if a server is away, or a file is no database of MLflow's or cannot be written.
+        """
+        path = Path(self.uri.removeprefix(SQLITE))
+        if not self.uri.startswith(SQLITE):
+            self.prepare()
+        elif self.enabled and make_folder(path.parent) and path.is_file():
+            damage_of(path, self.experiment, self.artifacts)
+
     def prepare(self) -> None:
-        """Make the store and the experiment before anything runs.
+        """Make the store and the experiment.
 
         Raises:
             StoreError: if a server is away or a database cannot be opened.
