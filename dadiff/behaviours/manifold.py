@@ -11,12 +11,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from dadiff.behaviours.pins import Pin, Pinned
 from dadiff.behaviours.projection import Projection, ProjectionInfo, check_shape
+from dadiff.behaviours.sets import identity
 from dadiff.errors import ConfigError
 from dadiff.experts.ilqr import Metric, Solution, Tracking, solve
 from dadiff.systems import System
@@ -74,8 +74,6 @@ class Tracker(Projection):
         self._set, self._where = target, where
         self._shape = (*target.robots, target.layout.size)
         self._x_init, self._pins = _starts_and_others(target.layout, pinned)
-        self._metrics: WeakKeyDictionary[Covariance, Metric] = WeakKeyDictionary()
-        self._identity = Metric.diagonal(target.layout, where.scale**2)
         self.info = ProjectionInfo(target.layout.rank - len(pinned.places), "manifold")
 
     def __call__(
@@ -105,8 +103,8 @@ class Tracker(Projection):
         self, z: np.ndarray, metric: Covariance | None, start: np.ndarray | None, noise: np.ndarray | None
     ) -> np.ndarray:
         """As `__call__`, of plans (*robots, plans, d) along one dimension."""
-        where, weights = self._where, self._identity if metric is None else self._in_physical_units(metric)
-        problem = self._problem(where.to_physical(z), weights)
+        where, layout = self._where, self._set.layout
+        problem = self._problem(where.to_physical(z), metric_of(metric or identity(layout), layout, where))
         begin = None if start is None else where.to_physical(start)
         solution = solve(problem, begin, sweeps=self._set.sweeps)
         self.info = self._observed(problem, solution)
@@ -127,21 +125,6 @@ class Tracker(Projection):
         pins = self._pins and (self._pins[0], np.broadcast_to(self._pins[1], (*lead, len(self._pins[0]))))
         return Tracking(self._set.system, metric, reference, x_init, pins)
 
-    def _in_physical_units(self, covariance: Covariance) -> Metric:
-        """Once for each covariance.
-
-        Raises:
-            ConfigError: if robots have covariances of their own.
-        """
-        if covariance not in self._metrics:
-            if covariance.diagonal.ndim > 1:
-                raise ConfigError(
-                    f"projection: the covariance is one of {covariance.diagonal.shape[0]} robots; nonlinear dynamics "
-                    "are projected onto in one metric for all"
-                )
-            self._metrics[covariance] = metric_of(covariance, self._set.layout, self._where)
-        return self._metrics[covariance]
-
     def _observed(self, problem: Tracking, solution: Solution) -> ProjectionInfo:
         """Plans that left float range or miss their pins have not reached the set."""
         missed = problem.violation(solution.tau)
@@ -153,7 +136,16 @@ class Tracker(Projection):
 
 
 def metric_of(covariance: Covariance, layout: TrajectoryLayout, where: Coordinates) -> Metric:
-    """C^-1 in physical units from C in scaled coordinates."""
+    """C^-1 in physical units from C in scaled coordinates.
+
+    Raises:
+        ConfigError: if robots have covariances of their own.
+    """
+    if covariance.diagonal.ndim > 1:
+        raise ConfigError(
+            f"projection: the covariance is one of {covariance.diagonal.shape[0]} robots; nonlinear dynamics are "
+            "projected onto in one metric for all"
+        )
     spread = covariance.invertible.rescaled(where.scale)
     return Metric.diagonal(layout, spread.diagonal, spread.factor)
 
