@@ -5,6 +5,7 @@ It separates what projecting does from what a network gets wrong, and makes samp
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Protocol, cast
 
@@ -39,7 +40,7 @@ class Law(Protocol):
     def mean(self, ends: np.ndarray) -> np.ndarray: ...
 
 
-class PosteriorMean:
+class PosteriorMean(ABC):
     """E[tau_0 | tau_i, E] of a Gaussian law, in scaled coordinates z = D^-1 (tau - mean); see its two forms."""
 
     def __init__(self, law: Law, coordinates: Coordinates, schedule: Schedule, device: str = "cpu") -> None:
@@ -72,9 +73,9 @@ class PosteriorMean:
         mu = self.mean(environment)
         return mu + self.shrunk(tau - float(self.alpha_bar[i]) ** 0.5 * mu, i)
 
+    @abstractmethod
     def shrunk(self, residual: Tensor, i: int) -> Tensor:
         """What of tau_i - sqrt(alpha_bar_i) mu (*robots, ..., d) is signal, as far as is to be expected."""
-        raise NotImplementedError
 
 
 class ExactDenoiser(PosteriorMean):

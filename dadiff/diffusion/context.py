@@ -35,7 +35,7 @@ class Project(Protocol):
 
 
 @runtime_checkable
-class Limiting(Protocol):
+class Limiting(Project, Protocol):
     """A projection onto dynamics within limits; see `dadiff.behaviours.Limited`."""
 
     @property

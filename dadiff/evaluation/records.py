@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections import ChainMap
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 
 from dadiff.tasks import Scores
 
-Stage = Literal["predict", "project", "end"]
-Observe = Callable[[int, Stage, Any], None]
+if TYPE_CHECKING:
+    from dadiff.diffusion.chain import Stage, Tensor
+
 Distance = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 SHOWN_SIGNAL = (0.0, 0.05, 0.25, 0.5, 0.75, 0.95, 1.0)
@@ -68,7 +69,7 @@ class ChainRecorder:
     rows: list[dict[str, Any]] = field(default_factory=list)
     _seen: list[tuple[int, np.ndarray]] = field(default_factory=list)
 
-    def __call__(self, j: int, stage: Stage, tau: Any) -> None:
+    def __call__(self, j: int, stage: Stage, tau: Tensor) -> None:
         """Record one half-step that reached step j; the end is none."""
         if stage == "end":
             return
@@ -110,7 +111,7 @@ class Snapshots:
         signal = np.sqrt(self.alpha_bar)
         return sorted({int(np.abs(signal - s).argmin()) for s in SHOWN_SIGNAL}, reverse=True)
 
-    def __call__(self, j: int, stage: Stage, tau: Any) -> None:
+    def __call__(self, j: int, stage: Stage, tau: Tensor) -> None:
         """Keep the plan after projection, at the first visited step at or below each shown one."""
         if stage != "predict":
             if j == 0 or any(j <= step < self._last for step in self.steps):

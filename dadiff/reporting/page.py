@@ -46,7 +46,7 @@ class Drawing:
 def draw(part: Part) -> Drawing:
     """A figure in all its forms."""
     files = render_figure(part.content, WIDE, FORMS["figures"])
-    title, name = getattr(part.content, "found", "") or part.item.title, part.item.id
+    title, name = part.found or part.item.title, part.item.id
     shapes = {"wide": files, "narrow": render_figure(part.content, NARROW, ("svg",))}
     if shapes["narrow"]["svg"] == files["svg"]:
         shapes = {"wide narrow": files}

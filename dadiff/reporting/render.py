@@ -143,7 +143,7 @@ def _claim(verdict: Verdict) -> dict[str, Any]:
 def _part(part: Part) -> dict[str, Any]:
     shown = {
         "title": part.item.title,
-        "found": getattr(part.content, "found", ""),
+        "found": part.found,
         "facts": part.facts,
         "notes": part.notes,
         "runs": part.runs,

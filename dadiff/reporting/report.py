@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 from dadiff.reporting.aggregation import Evidence, Method
 from dadiff.reporting.claims import Claim, Verdict, judge
@@ -12,6 +12,14 @@ from dadiff.reporting.sources import ReportedRun
 
 WITHOUT_INTERVALS = ("paths", "diffusion", "chain")
 """Kinds of figures that show single plans or runs."""
+
+
+@runtime_checkable
+class Telling(Protocol):
+    """Content of a figure that says in a sentence what was found."""
+
+    @property
+    def found(self) -> str: ...
 
 
 @dataclass(frozen=True)
@@ -23,6 +31,11 @@ class Part:
     facts: str
     notes: list[str]
     runs: list[str]
+
+    @property
+    def found(self) -> str:
+        """What its numbers say, where it has a sentence for that."""
+        return self.content.found if isinstance(self.content, Telling) else ""
 
     @property
     def empty(self) -> bool:

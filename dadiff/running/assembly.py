@@ -162,7 +162,7 @@ class Experiment:
         return "cuda" if there and wanted != "cpu" else "cpu"
 
     @cached_property
-    def denoiser(self) -> Any:
+    def denoiser(self) -> Denoiser:
         """The exact denoiser, or the trained one from the cache or trained now."""
         recipe = self.parts.denoiser
         if isinstance(recipe, ExactRecipe):
@@ -238,7 +238,9 @@ class Experiment:
         if not isinstance(self.target, Robots):
             return self.planner
         one = self.target.take([robot])
-        sources = {name: _of_robot(source, robot) for name, source in self.sources.items()}
+        sources = dict(self.sources)
+        if (recording := sources.get("recording")) is not None:
+            sources["recording"] = Recording(recording.states[robot : robot + 1], recording.inputs[robot : robot + 1])
         return replace(self.planner, system=one, behaviour=self.parts.projector.fit(self.layout, system=one, **sources))
 
     @property
@@ -335,10 +337,3 @@ class Experiment:
         found = least_squares(Transitions.of(*self.layout.split(learned)), "estimated")
         G, g = found.stages(self.layout.horizon).matrix(self.layout)
         return G * where.scale, g if self.encoder else g - G @ where.mean
-
-
-def _of_robot(source: Any, robot: int) -> Any:
-    """A recording of one robot; demonstrations are not a robot's."""
-    if not isinstance(source, Recording):
-        return source
-    return Recording(source.states[robot : robot + 1], source.inputs[robot : robot + 1])

@@ -9,14 +9,14 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 import pandas as pd
 import torch
 import yaml
 
-from dadiff.behaviours import Known, Nominal, compared, model_of, pins, prediction_error
+from dadiff.behaviours import Known, Nominal, Projection, compared, model_of, pins, prediction_error
 from dadiff.diffusion.chain import Samples
 from dadiff.diffusion.context import Limiting
 from dadiff.diffusion.enforcement import PostHoc
@@ -43,11 +43,14 @@ EXAMPLE_ROBOTS = 3
 EXACT_SCORES = ("exact_distance", "exact_mean_distance", "exact_spread")
 
 
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
 @dataclass
-class Timed:
+class Timed(Generic[Function]):
     """A function that counts its calls and the seconds they take, on an accelerator too."""
 
-    function: Callable[..., Any]
+    function: Function
     device: str = "cpu"
     calls: int = 0
     seconds: float = 0.0
@@ -71,18 +74,18 @@ class Timed:
             torch.cuda.synchronize(self.device)
 
 
-class TimedWithinLimits(Timed):
+class TimedWithinLimits(Timed[Limiting]):
     """A projection that keeps to limits, and is asked without them, too."""
 
     @property
     def unlimited(self) -> Callable[..., Any]:
         """See `dadiff.diffusion.context.Limiting`."""
-        return partial(self.timed, self.function.unlimited)  # type: ignore[attr-defined]
+        return partial(self.timed, self.function.unlimited)
 
     @property
     def box(self) -> tuple[np.ndarray, np.ndarray]:
         """See `dadiff.diffusion.context.Limiting`."""
-        return self.function.box  # type: ignore[attr-defined]
+        return self.function.box
 
 
 @dataclass
@@ -130,7 +133,7 @@ def draw_plans(experiment: Experiment) -> Plans:
     return Plans(experiment.coordinates.to_physical(tau), samples, measures, chain, snapshots)
 
 
-def measured_projection(experiment: Experiment, environment: np.ndarray) -> tuple[Timed | None, dict[str, float]]:
+def measured_projection(experiment: Experiment, environment: np.ndarray) -> tuple[Timed[Any] | None, dict[str, float]]:
     """The projection bound to coordinates and conditions E (*robots, plans, c), and what is measured of its set."""
     start = time.perf_counter()
     behaviour = experiment.behaviour
@@ -148,8 +151,9 @@ def measured_projection(experiment: Experiment, environment: np.ndarray) -> tupl
         measures |= compared(behaviour, Known().fit(experiment.layout, experiment.target), held)
         measures |= prediction_error(behaviour, experiment.target, experiment.cases.reference)
         measures |= cost_of_model(experiment, model_of(behaviour))
-    timed = TimedWithinLimits if isinstance(projection, Limiting) else Timed
-    return timed(projection, experiment.device), measures
+    if isinstance(projection, Limiting):
+        return TimedWithinLimits(projection, experiment.device), measures
+    return Timed(projection, experiment.device), measures
 
 
 def cost_of_model(experiment: Experiment, model: System | None) -> dict[str, float]:
@@ -166,7 +170,7 @@ def cost_of_model(experiment: Experiment, model: System | None) -> dict[str, flo
     return {"model_cost_ratio": float(ratio.mean()), "model_cost_ratio_median": float(np.median(ratio))}
 
 
-def unconverged(projection: Any) -> dict[str, float]:
+def unconverged(projection: Projection) -> dict[str, float]:
     """How many plans the last projection did not bring into the set, and for how many the set is proven to be empty.
 
     Nothing of closed forms, which always do.
@@ -174,7 +178,8 @@ def unconverged(projection: Any) -> dict[str, float]:
     info = projection.info
     if info.kind in ("dense", "blocks"):
         return {}
-    return {"unconverged": info.unconverged} | ({"infeasible": info.infeasible} if info.kind == "limited" else {})
+    found: dict[str, float] = {"unconverged": info.unconverged}
+    return found | ({"infeasible": info.infeasible} if info.kind == "limited" else {})
 
 
 def _observers(experiment: Experiment, environment: np.ndarray) -> tuple[ChainRecorder | None, Snapshots]:
