@@ -96,3 +96,5 @@ def test_what_cannot_be_is_refused():
 def test_steps_in_machine_code_are_those_of_the_integrator(system, plans, rng):
     x, u = (rng.standard_normal((*system.robots, *plans, size)) for size in (6, 2))
     np.testing.assert_allclose(system.step(x, u), Continuous.step(system, x, u), rtol=1e-13, atol=1e-13)
+    for found, expected in zip(system.linearise(x, u), Continuous.linearise(system, x, u), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)

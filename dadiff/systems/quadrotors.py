@@ -11,7 +11,7 @@ import numpy as np
 
 from dadiff.errors import ConfigError
 from dadiff.systems.families import Family, Ranges, Robots
-from dadiff.systems.nonlinear import STAGES, Continuous
+from dadiff.systems.nonlinear import STAGES, Continuous, affine
 from dadiff.systems.system import Bounds, Limits, Times, turned
 
 GRAVITY = 9.81  # m/s^2
@@ -59,8 +59,20 @@ class PlanarQuadrotor(Continuous):
         """As `Continuous.step`, in machine code."""
         from dadiff.systems.quadrotor_steps import steps
 
-        flat = (len(self._each), -1)
-        return steps(x.reshape(*flat, 6), u.reshape(*flat, 2), self._each, GRAVITY, self._stages).reshape(x.shape)
+        return steps(*self._flat(x, u)).reshape(x.shape)
+
+    def linearise(self, x: np.ndarray, u: np.ndarray, t: Times = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """As `Continuous.linearise`, in machine code."""
+        from dadiff.systems.quadrotor_steps import linearised
+
+        J, following = linearised(*self._flat(x, u))
+        J = J.reshape(*x.shape, 8)
+        return affine(J[..., :6], J[..., 6:], following.reshape(x.shape), x, u)
+
+    def _flat(self, x: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, float, np.ndarray]:
+        """What the compiled functions ask for; points along one dimension after the robots'."""
+        lead = (len(self._each), -1)
+        return x.reshape(*lead, 6), u.reshape(*lead, 2), self._each, GRAVITY, self._stages
 
     @cached_property
     def _each(self) -> np.ndarray:
