@@ -15,8 +15,8 @@ from dadiff.diffusion.chain import Samples, sample
 from dadiff.diffusion.conditional import Conditional
 from dadiff.diffusion.context import Context, Counted, unprojected
 from dadiff.diffusion.enforcement import CleanEstimate, Convex, Literally, Never, Normalised, PostHoc
-from dadiff.diffusion.estimate import Estimate
 from dadiff.diffusion.limiting import Barrier, QPFilter
+from dadiff.diffusion.measured import Measured
 from dadiff.diffusion.rivals import DPS, MCG, PPR, TMPD, PiGDM, Replacement, RolloutBlend, Selected
 from dadiff.diffusion.samplers import DDIM, DDPM, Step
 from dadiff.diffusion.schedule import Schedule, cosine, ddpm_linear, paper_linear
@@ -68,7 +68,9 @@ def projection(initial_state="free"):
 
 
 LAW = LQR(horizon=HORIZON, state_cost=(1.0,) * 3).law(SYSTEM)
-ESTIMATE = Estimate(LAW.covariance, np.full(LAYOUT.size, 0.02), np.ones(LAYOUT.size), layout=LAYOUT)
+ESTIMATE = Measured(
+    LAW.covariance, np.full(LAYOUT.size, 0.02), np.ones(LAYOUT.size), layout=LAYOUT, errors={"1": LAW.covariance}
+)
 
 
 def draw(enforcement, project, sampler=None, schedule: Schedule | None = None, **options) -> Samples:

@@ -21,6 +21,7 @@ from dadiff.denoisers import MLP, Gaussian
 from dadiff.diffusion.conditional import Conditional
 from dadiff.diffusion.enforcement import CleanEstimate
 from dadiff.diffusion.estimate import Estimate
+from dadiff.diffusion.measured import Measured
 from dadiff.diffusion.samplers import DDIM
 from dadiff.diffusion.schedule import paper_linear
 from dadiff.errors import CheckpointError, DadiffError, DataError, ShapeError
@@ -377,10 +378,11 @@ def every_set() -> dict[str, TrajectorySet]:
 
 
 @pytest.mark.parametrize("name", ["HankelLowRank", "IdentifiedSoft", "Inpainting", "Known", "Limited"])
-@pytest.mark.parametrize("enforcement", [Conditional(), Conditional(spread=True), CleanEstimate()], ids=str)
+@pytest.mark.parametrize("enforcement", [Conditional(), Conditional("measured"), CleanEstimate()], ids=str)
 def test_every_set_and_the_estimates_law_are_in_the_file(tmp_path, name, enforcement):
     shown = TASK.demonstrations(SYSTEM, 300, np.random.default_rng(0))
-    weighed = Estimate.of_demonstrations(LAYOUT, physical(LAYOUT), shown.trajectories, shown.environment)
+    made = Estimate.of_demonstrations(LAYOUT, physical(LAYOUT), shown.trajectories, shown.environment)
+    weighed = Measured(made.covariance, made.deviation, made.unit, LAYOUT, {"1": made.covariance})
     before = replace(planner(), behaviour=every_set()[name], enforcement=enforcement, estimate=weighed)
     after = Planner.load(before.save(tmp_path / "robot.zip"))
     np.testing.assert_array_equal(plan_of(after).tau, plan_of(before).tau)

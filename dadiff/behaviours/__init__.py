@@ -1,7 +1,7 @@
 """Behaviours: the sets of admissible trajectories, what they are learned from, and the projections onto them."""
 
 from dadiff.behaviours.doubt import Doubted, DoubtedManifold
-from dadiff.behaviours.family import IdentifiedFamily
+from dadiff.behaviours.family import IdentifiedFamily, disturbances
 from dadiff.behaviours.identified import Identified, IdentifiedSoft, IdentifiedSparse, IdentifiedSparseSoft, Koopman
 from dadiff.behaviours.known import (
     Inpainting,
@@ -64,6 +64,7 @@ __all__ = [
     "Transitions",
     "Uncertain",
     "compared",
+    "disturbances",
     "least_squares",
     "model_of",
     "pins",

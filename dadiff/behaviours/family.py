@@ -190,6 +190,26 @@ class Channels:
         return Stages(A, B, self.size_x * stages.c + moved + c[..., None, :])
 
 
+def disturbances(layout: TrajectoryLayout, trajectories: np.ndarray, *, family: bool) -> np.ndarray:
+    """The process noise of demonstrations (N, d), (N, nT): x(t+1) less A x(t) + B u(t) + c.
+
+    Args:
+        family: they are of many robots, each of which is known as well as its demonstration and the others together
+            say, by empirical Bayes. Else they are of one, which least squares find.
+    """
+    if not family:
+        found = least_squares(Transitions.of(*layout.split(trajectories)), "estimated")
+        G, g = found.stages(layout.horizon).matrix(layout)
+        return trajectories @ G.T - g
+    channels = Channels.of(layout, trajectories, centred=True)
+    states, inputs = layout.split(channels.scaled_trajectories(layout, trajectories))
+    usual = prior(layout, layout.flatten(states, inputs), constant=True)
+    each = Transitions.of(states[:, None], inputs[:, None])
+    theta = usual.given(Moments.of(each, constant=True), usual.noise).mean.reshape(len(states), -1, layout.state_dim)
+    phi = np.concatenate([each.x, each.u, np.ones((*each.x.shape[:-1], 1))], axis=-1)
+    return ((each.following - phi @ theta) * channels.size_x).reshape(len(states), -1)
+
+
 @dataclass(frozen=True)
 class IdentifiedFamily(Fitted[Uncertain]):
     """One robot's dynamics from a short recording, and from what demonstrations of its family say is usual.

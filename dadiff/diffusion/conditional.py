@@ -25,7 +25,7 @@ from dadiff.trajectory.covariance import Covariance
 ALL_UP_TO = 600
 LEADING = 64
 
-Metric = Literal["estimate", "diagonal", "standardised", "physical"]
+Metric = Literal["estimate", "measured", "diagonal", "standardised", "physical"]
 
 
 @dataclass(frozen=True)
@@ -33,8 +33,9 @@ class Conditional(Never):
     """P on the clean estimate, in the metric of the covariance that the denoiser leaves open.
 
     Args:
-        metric: C is the `estimate`'s covariance C_i + floor Sigma, its `diagonal`, or says nothing of the task: equal
-            variances of `standardised` channels, or of `physical` units.
+        metric: C is the `estimate`'s covariance C_i + floor Sigma, with both as `measured` on demonstrations
+            (`dadiff.diffusion.measured`), its `diagonal`, or says nothing of the task: equal variances of
+            `standardised` channels, or of `physical` units.
         floor, shrinkage: see `dadiff.diffusion.estimate.Estimate`.
         directions: of C that are kept beside a diagonal; 0 keeps all, None does so up to d = ALL_UP_TO, and beyond it
             LEADING, with which long horizons are projected onto in O(T).
@@ -59,6 +60,11 @@ class Conditional(Never):
                 "at least 0, in [0, 1] and at least 0"
             )
 
+    @property
+    def measures(self) -> bool:
+        """With metric=measured."""
+        return self.metric == "measured"
+
     def weights(self, step: Step, schedule: Schedule) -> Step:
         """With `spread`, those of the bridge; else the sampler's."""
         return bridge(step, schedule) if self.spread and step.call else step
@@ -76,6 +82,8 @@ class Conditional(Never):
         estimate, alpha_bar = at.known_estimate(), float(at.schedule.alpha_bar[at.step.i])
         if self.metric == "estimate":
             return estimate.at(alpha_bar, self.floor, self.shrinkage, self.kept(estimate.size))
+        if self.measures:
+            return estimate.at_step(at.step.i, self.floor, self.shrinkage, self.kept(estimate.size))
         if self.metric == "diagonal":
             return estimate.diagonal(alpha_bar, self.floor)
         return estimate.standardised if self.metric == "standardised" else estimate.physical

@@ -23,11 +23,14 @@ class Enforcement(Protocol):
     """What the sampler asks.
 
     `affine` tells whether the operator is meaningful for affine sets, `weighs` whether it asks for the covariance of
-    the clean estimate.
+    the clean estimate, `measures` whether for the one that is measured on demonstrations.
     """
 
     affine: ClassVar[bool]
     weighs: ClassVar[bool]
+
+    @property
+    def measures(self) -> bool: ...
 
     def weights(self, step: Step, schedule: Schedule) -> Step: ...
 
@@ -46,6 +49,11 @@ class Never:
 
     affine: ClassVar[bool] = True
     weighs: ClassVar[bool] = False
+
+    @property
+    def measures(self) -> bool:
+        """No."""
+        return False
 
     def weights(self, step: Step, schedule: Schedule) -> Step:
         """The step with the sampler's weights."""

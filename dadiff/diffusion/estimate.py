@@ -17,7 +17,7 @@ from functools import cached_property
 
 import numpy as np
 
-from dadiff.errors import ConfigError, ShapeError
+from dadiff.errors import ConfigError, NotApplicableError, ShapeError
 from dadiff.trajectory.coordinates import Coordinates, standardised
 from dadiff.trajectory.covariance import Covariance
 from dadiff.trajectory.layout import TrajectoryLayout
@@ -94,6 +94,17 @@ class Estimate:
             ConfigError: if demonstrations do not spread at all given E and shrinkage is 0.
         """
         return self._kept((alpha_bar, floor, shrinkage, directions), self._at)
+
+    def at_step(self, i: int, floor: float = 0.0, shrinkage: float = 0.0, directions: int = 0) -> Covariance:
+        """C_i + floor Sigma with C_i as measured at step i, see `dadiff.diffusion.measured`.
+
+        Raises:
+            NotApplicableError: if nothing was measured.
+        """
+        raise NotApplicableError(
+            "enforcement: metric=measured weighs by a network's errors on demonstrations, and none were measured; use "
+            "metric=estimate"
+        )
 
     def diagonal(self, alpha_bar: float, floor: float = 0.0) -> Covariance:
         """C_i + floor Sigma of diag(Sigma): each entry for itself."""

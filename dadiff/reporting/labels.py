@@ -51,6 +51,7 @@ WORDS: dict[str, dict[str, str]] = {
     },
     "enforcement.metric": {
         "estimate": "metric of the estimate",
+        "measured": "metric as measured",
         "diagonal": "diagonal metric",
         "standardised": "standardised metric",
         "physical": "physical metric",

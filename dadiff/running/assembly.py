@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dadiff.behaviours import TrajectorySet, Transitions, least_squares, starts_fixed
+from dadiff.behaviours import TrajectorySet, Transitions, disturbances, least_squares, starts_fixed
 from dadiff.datasets.cached import load_data, save_data
 from dadiff.denoisers.recipes import ExactRecipe, Recipe
 from dadiff.denoisers.training import InformedTraining
 from dadiff.diffusion.estimate import Estimate
+from dadiff.diffusion.measured import asked, measured
 from dadiff.errors import ConfigError, NotApplicableError
 from dadiff.evaluation import ClosedLoop, Exact
 from dadiff.experts.lqr import GaussianLaw
@@ -23,7 +24,7 @@ from dadiff.running.data import told_of_data
 from dadiff.running.identity import SHARED, Artefact, Identity, Shared, identity_of
 from dadiff.running.parts import Parts
 from dadiff.store import Cache, Results
-from dadiff.systems import Recording, Robots, System, Unknown
+from dadiff.systems import Linear, Recording, Robots, System, Unknown
 from dadiff.tasks import Cases, Demonstrations
 from dadiff.tasks.encodings import Encoder
 from dadiff.tasks.task import Augmenting, Lawful
@@ -210,8 +211,16 @@ class Experiment:
             starts_fixed(self.parts.projector),
             self.parts.evaluation.divergence_bound,
             self.device,
-            self.estimate if self.parts.enforcement.weighs and self.behaviour is not None else None,
+            self._weighed_by(denoiser),
         )
+
+    def _weighed_by(self, denoiser: Denoiser) -> Estimate | None:
+        """What the enforcement asks for of the estimate's law."""
+        by = self.parts.enforcement
+        if not by.weighs or self.behaviour is None:
+            return None
+        trained = not isinstance(self.parts.denoiser, ExactRecipe)
+        return self._measured(denoiser) if by.measures and trained else self.estimate
 
     def rehearse(self, recipe: Recipe) -> None:
         """Plan once with a network that has learned nothing, near a demonstration, so as not to train it in vain.
@@ -232,6 +241,22 @@ class Experiment:
             covariance = self.law.covariance / where.scale[:, None] / where.scale
             return Estimate.of_covariance(self.layout, where, shown.trajectories, covariance)
         return Estimate.of_demonstrations(self.layout, where, shown.trajectories, shown.environment)
+
+    def _measured(self, denoiser: Denoiser) -> Estimate:
+        """The network's own errors on demonstrations, in which the noise of linear dynamics is no error."""
+        schedule, some = self.parts.schedule, asked(len(self.demonstrations.trajectories), self.layout.size)
+        tau, environment = self.demonstrations.trajectories[some], self.demonstrations.environment[some]
+        linear = isinstance(self.target, Linear)
+        return measured(
+            self.estimate,
+            denoiser,
+            schedule,
+            [step.i for step in self.parts.sampler.steps(schedule) if step.call],
+            self.coordinates.to_scaled(tau),
+            environment,
+            disturbances(self.layout, tau, family=isinstance(self.target, Robots)) if linear else None,
+            self.device,
+        )
 
     def planner_of(self, robot: int) -> Planner:
         """The planner of one robot of a fleet, its dimension kept; of one system, the planner."""
