@@ -34,6 +34,17 @@ def test_rows_are_ordered_by_rank_and_the_best_has_the_least_error(evidence):
     assert "rank" in tables.to_csv(table).splitlines()[0]
 
 
+def test_a_tuned_parameter_stands_at_its_best_and_is_named(evidence):
+    asked = {"cells": {"projector": "known", "denoiser": "mlp"}, "metrics": [METRIC]}
+    judged = [row for row in tables.collect(evidence, **asked).rows if row.values[METRIC]]
+    assert len(judged) == 2
+    found = tables.collect(evidence, **asked, ranked_by=METRIC, tuned=["enforcement"]).rows
+    (best,) = (row for row in found if row.values[METRIC])
+    assert best.values[METRIC].mean.value == min(row.values[METRIC].mean.value for row in judged)
+    assert best.label in {row.label for row in judged}
+    assert len(found) == 2  # the other diverged, and stays
+
+
 def test_methods_without_the_metric_have_no_place(evidence):
     methods = evidence.methods({})
     assert places(methods, "no_such_metric", None) == [None] * len(methods)

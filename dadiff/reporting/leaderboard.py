@@ -6,6 +6,7 @@ first, so that a case counts once.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,6 +51,22 @@ def places(methods: list[Method], metric: str, baseline: Method | None) -> list[
         compared = None if methods[k] is baseline or against is None or against.size != most else against
         standing[k] = Place(median(ranks[row]), None if compared is None else wins(values[row], compared))
     return standing
+
+
+def at_their_best(methods: list[Method], metric: str, tuned: Sequence[str]) -> list[Method]:
+    """Of methods that differ in `tuned` parameters alone the one with the least mean, on the cases it is shown on.
+
+    Those without the metric are kept as they are.
+    """
+    groups = dict[str, list[Method]]()
+    for method in methods:
+        groups.setdefault(repr(sorted((k, v) for k, v in method.axes.items() if k not in tuned)), []).append(method)
+    kept = []
+    for alike in groups.values():
+        judged = [method for method in alike if method.finished and has_metric(method.finished, metric)]
+        best = min(judged, key=lambda method: float(method.runs.scalars(metric).values.mean()), default=None)
+        kept += [method for method in alike if method is best or method not in judged]
+    return kept
 
 
 def _by_case(method: Method, metric: str) -> np.ndarray | None:

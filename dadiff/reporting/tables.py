@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import csv
 import io
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 from dadiff.outside import spreadsheet_safe
 from dadiff.reporting.aggregation import LEVELS, Evidence, Method, has_metric, pair, varying
 from dadiff.reporting.labels import FLOORS, METRICS, method_name
-from dadiff.reporting.leaderboard import Place, places
+from dadiff.reporting.leaderboard import Place, at_their_best, places
 from dadiff.reporting.selection import Selector
 from dadiff.reporting.statistics import Estimate, difference, mean, ratio
 from dadiff.store.record import ABOUT_DATA, is_odd
@@ -64,6 +65,7 @@ def collect(
     relative_to: Selector | None = None,
     group: str | None = None,
     ranked_by: str | None = None,
+    tuned: Sequence[str] = (),
 ) -> Table:
     """The methods that `cells` asks for; metrics that none of them has are left out, those about data from files stand
     in every table.
@@ -73,12 +75,16 @@ def collect(
         relative_to: the baseline of ratios and differences.
         group: of a fleet, the robots of this group alone.
         ranked_by: a metric, the less the better, by which methods have a `rank` and `wins`, and rows their order.
+        tuned: axes of which the best value by that metric is taken and named.
     """
     methods = evidence.methods(cells)
+    if ranked_by and tuned:
+        methods = at_their_best(methods, ranked_by, tuned)
+    shown = list(dict.fromkeys([*varying(methods), *tuned]))
     metrics = [name for asked in metrics for name in (_own(methods) if asked == "..." else [asked])]
     wanted = dict.fromkeys([*metrics, *ABOUT_DATA])
     kept = [name for name in wanted if any(m.finished and has_metric(m.finished, name) for m in methods)]
-    rows = [_row(evidence, method, kept, varying(methods), relative_to, group) for method in methods]
+    rows = [_row(evidence, method, kept, shown, relative_to, group) for method in methods]
     if ranked_by:
         kept, rows = _ranked(evidence, methods, kept, rows, ranked_by, relative_to)
     return Table(kept, method_name(dict(relative_to), relative_to) if relative_to else "", rows, _odd(methods))
