@@ -2,6 +2,8 @@
 PYTHON ?= python3.11
 RUN := .venv/bin
 OUTPUTS ?= outputs
+# Of the longer training: rounded where the processor multiplies such numbers faster (docs/speed.md).
+PRECISION ?= $(shell grep -qs amx_bf16 /proc/cpuinfo && echo bfloat16 || echo float32)
 export MLFLOW_DISABLE_TELEMETRY := true
 
 .PHONY: help install report test slow lint bench mutants clean
@@ -32,7 +34,7 @@ install: .venv/installed
 report: install
 	$(RUN)/dadiff +sweeps=lqr_quick output_dir=$(OUTPUTS)
 	$(RUN)/dadiff-report lqr_quick --log --output-dir $(OUTPUTS)
-	$(RUN)/dadiff +sweeps=obstacles_quick output_dir=$(OUTPUTS)
+	$(RUN)/dadiff +sweeps=obstacles_quick training.precision=$(PRECISION) output_dir=$(OUTPUTS)
 	$(RUN)/dadiff-report obstacles_quick --log --output-dir $(OUTPUTS)
 	@echo
 	@echo "reports: $(OUTPUTS)/reports/lqr_quick/index.html  $(OUTPUTS)/reports/obstacles_quick/index.html"

@@ -55,7 +55,7 @@ class NetworkDenoiser(nn.Module):
         self.made_from = NetworkParts(recipe, layout, condition, schedule)
         self.description = describe(recipe, layout, condition, schedule)
         self.estimate_tau, self.estimate_output = table.estimate_tau, table.estimate_output
-        self.network = network.to_empty(device="cpu")
+        self.network = network._apply(_unfilled)  # where `to_empty` would first load sympy
         initialise(self.network, generator)
         self.register_buffer("environment_mean", torch.zeros(condition.size))
         self.register_buffer("environment_scale", torch.ones(condition.size))
@@ -127,6 +127,10 @@ class NetworkParts:
 def on_meta() -> AbstractContextManager[object]:
     """Modules built inside draw no initial weights: torch's own drawing would move its global random state."""
     return torch.device("meta")
+
+
+def _unfilled(meta: Tensor) -> Tensor:
+    return torch.empty(meta.shape, dtype=meta.dtype)
 
 
 @torch.no_grad()

@@ -196,19 +196,20 @@ class State:
 
     Attributes:
         step: gradient steps done.
-        running_mean: of `weights`, in their order.
+        adam: of Adam's state its parts, as torch calls them; like `running_mean` of `weights`, in their order.
         losses, seconds: per step, (steps,).
     """
 
     denoiser: NetworkDenoiser
     training: Training
     step: int = 0
-    optimiser: torch.optim.Adam = field(init=False)
+    adam: dict[str, list[Tensor]] = field(init=False)
     running_mean: list[Tensor] = field(init=False)
 
     def __post_init__(self) -> None:
         self.weights = list(self.denoiser.parameters())
-        self.optimiser = torch.optim.Adam(self.weights, self.training.learning_rate, fused=True)
+        self.adam = {name: [torch.zeros_like(w) for w in self.weights] for name in ("exp_avg", "exp_avg_sq")}
+        self.adam["step"] = [torch.zeros((), device=w.device) for w in self.weights]
         self.running_mean = [w.detach().clone() for w in self.weights]
         self.losses = torch.zeros(self.training.steps, device=self.weights[0].device)
         self.seconds = torch.zeros(self.training.steps, dtype=torch.float64)
@@ -216,22 +217,30 @@ class State:
 
     def advance(self, objective: Objective, data: Data) -> None:
         """One gradient step."""
-        for group in self.optimiser.param_groups:
-            group["lr"] = self.training.learning_rate_at(self.step)
         loss = objective(self.denoiser, *data.draw())
-        self.optimiser.zero_grad()
         loss.backward()
-        self.optimiser.step()
+        self._descend()
         self._average()
         self.losses[self.step] = loss.detach()
         self.seconds[self.step] = time.perf_counter() - self._begun
         self.step += 1
 
     @torch.no_grad()
+    def _descend(self) -> None:
+        """A step of Adam (Kingma & Ba 2015), as `torch.optim.Adam(fused=True)`, which takes a second to be made."""
+        m, v, steps = self.adam["exp_avg"], self.adam["exp_avg_sq"], self.adam["step"]
+        torch._foreach_add_(steps, 1)
+        torch._fused_adam_(
+            *(self.weights, [w.grad for w in self.weights], m, v, [], steps),
+            **{"lr": self.training.learning_rate_at(self.step), "beta1": 0.9, "beta2": 0.999, "eps": 1e-8},
+            **{"weight_decay": 0.0, "amsgrad": False, "maximize": False},
+        )
+        for w in self.weights:
+            w.grad = None
+
+    @torch.no_grad()
     def _average(self) -> None:
-        keep = self.training.ema_decay_at(self.step)
-        for mean, weight in zip(self.running_mean, self.weights, strict=True):
-            mean.lerp_(weight, 1 - keep)
+        torch._foreach_lerp_(self.running_mean, self.weights, 1 - self.training.ema_decay_at(self.step))
 
     def recent_loss(self) -> float:
         """Mean over the last 100 steps."""
@@ -244,8 +253,7 @@ class State:
             tensors[f"running_mean.{k}"] = mean
         tensors |= {"losses": self.losses, "seconds": self.seconds, "step": torch.tensor(self.step)}
         tensors |= {f"generator.{role}": g.get_state() for role, g in data.generators.items()}
-        for k, moments in self.optimiser.state_dict()["state"].items():
-            tensors |= {f"adam.{k}.{name}": tensor for name, tensor in moments.items()}
+        tensors |= {f"adam.{k}.{name}": part for name, parts in self.adam.items() for k, part in enumerate(parts)}
         return tensors
 
     def store(self, path: Path, data: Data, description: Description) -> None:
@@ -255,21 +263,11 @@ class State:
     def resume(self, path: Path, data: Data, description: Description) -> None:
         """Continue from a checkpoint: the next steps are those that an uninterrupted training would take."""
         tensors = read(path, description)
-        self._make_moments()
         fill(self._tensors(data), tensors, path)
         for role, generator in data.generators.items():
             generator.set_state(tensors[f"generator.{role}"])
         self.step = int(tensors["step"])
         self._begun = time.perf_counter() - float(self.seconds[self.step - 1])
-
-    def _make_moments(self) -> None:
-        """Have Adam create its moments, which it otherwise does in its first step."""
-        for w in self.weights:
-            self.optimiser.state[w] = {
-                "step": torch.zeros((), device=w.device),
-                "exp_avg": torch.zeros_like(w),
-                "exp_avg_sq": torch.zeros_like(w),
-            }
 
     def write_curve(self, path: Path) -> None:
         """The loss curve: step, loss (mean since the last row), learning_rate, seconds."""

@@ -25,7 +25,7 @@ from dadiff.randomness import numpy_generator
 from dadiff.systems import System
 from dadiff.tasks.task import Cases, Demonstrations, Steering
 
-TIMED_PLANS, TIMED_SECONDS = 100, 2.0  # plans of one case, one at a time, for the latency
+TIMED_PLANS, TIMED_SECONDS = 100, 1.0  # plans of one case, one at a time, for the latency
 
 
 @dataclass(frozen=True)
