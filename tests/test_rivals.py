@@ -209,10 +209,11 @@ def test_of_the_plans_for_one_case_that_is_selected_which_was_moved_least():
     close(rival.end(plans, fleet), torch.stack([TAU[[best, best, 2]], EPS[[1 - best, 1 - best, 2]]]))
 
 
-def test_a_metric_for_each_plan_projects_each_plan_in_its_own():
-    factors = np.random.default_rng(5).standard_normal((PLANS, SIZE, SIZE))
-    P = context().project
-    together = P(TAU0, Covariance(np.full((PLANS, SIZE), 0.1), factors))
+@pytest.mark.parametrize("count", [0, SIZE])
+def test_a_metric_for_each_plan_projects_each_plan_in_its_own(count):
+    rng, P = np.random.default_rng(5), context().project
+    factors, variances = rng.standard_normal((PLANS, SIZE, count)), rng.uniform(0.1, 1, (PLANS, SIZE))
+    together = P(TAU0, Covariance(variances, factors))
     for k in range(PLANS):
-        alone = P(TAU0[[k]], Covariance(np.full(SIZE, 0.1), factors[k]))
+        alone = P(TAU0[[k]], Covariance(variances[k], factors[k]))
         close(together[[k]], alone)

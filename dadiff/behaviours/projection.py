@@ -188,8 +188,8 @@ class Projection:
     def _plan_by_plan(self, tau: Array, metric: Covariance) -> Array:
         """The projection with a metric (*robots, plans..., d) for each plan, which is used once."""
         *robots, d = self._shape
-        factor = metric.factor.reshape(*robots, -1, d, metric.factor.shape[-1])
-        each = Covariance(metric.diagonal.reshape(*robots, -1, d), factor)
+        diagonal = metric.diagonal.reshape(*robots, -1, d)
+        each = Covariance(diagonal, metric.factor.reshape(*diagonal.shape, metric.factor.shape[-1]))
         made = self._geometry.form(each)
         form, given = like(made, tau), like(made.given(self._pinned.values[..., None, :]), tau)
         return form(tau.reshape(*robots, -1, 1, d), given).reshape(tau.shape)
