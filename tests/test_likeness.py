@@ -56,10 +56,11 @@ def test_the_energy_distance_is_that_of_its_definition():
 def test_robots_have_laws_of_their_own():
     task = Fleet(horizon=4, robots=3, interpolation=2, extrapolation=1)
     robots = task.target(DampedIntegrators())
-    cases, law = task.cases(robots, 2, np.random.default_rng(0)), LQR(horizon=4).law(robots)
+    cases = task.cases(robots, 2, np.random.default_rng(0))
+    law, told = task.of_runs(robots, cases.environment)
     eps = np.random.default_rng(1).standard_normal((*robots.robots, 2, 3, law.noise_map.shape[-1]))
-    planned = law.mean(cases.environment)[..., None, :] + along(law.noise_map, eps)
-    found = likeness(robots.layout(4), planned, law, cases.environment, np.random.default_rng(2))
+    planned = law.mean(told)[..., None, :] + along(law.noise_map, eps)
+    found = likeness(robots.layout(4), planned, law, told, np.random.default_rng(2))
     assert found.per_plan["energy_distance"].shape == (3, 2, 3)
     assert found.per_step["coverage"].shape == found.per_step["state_spread_ratio"].shape == (3, 2, 3, 5)
 

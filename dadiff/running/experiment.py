@@ -36,7 +36,7 @@ from dadiff.running.provenance import record_of
 from dadiff.store import StoredRun
 from dadiff.systems import Robots, System, TimeVarying, Unknown
 from dadiff.tasks import Scores
-from dadiff.tasks.task import Lawful, Steering
+from dadiff.tasks.task import Repeatable, Steering
 from dadiff.trajectory import TrajectoryLayout
 
 EXAMPLE_ROBOTS = 3
@@ -248,10 +248,11 @@ def evaluate(experiment: Experiment, planned: np.ndarray) -> Scores:
 def experts_likeness(experiment: Experiment, planned: np.ndarray) -> Scores:
     """Plans against fresh runs of the expert, where the law of these is known: it knows no bounds."""
     task, system = experiment.parts.task, experiment.target
-    if not isinstance(task, Lawful) or system.bounds.any:
+    if not isinstance(task, Repeatable) or system.bounds.any:
         return Scores()
+    law, told = task.of_runs(system, experiment.cases.environment)
     rng = numpy_generator(experiment.parts.evaluation.seed, "fresh runs of the expert")
-    return likeness(experiment.layout, planned, task.law(system), experiment.cases.environment, rng)
+    return likeness(experiment.layout, planned, law, told, rng)
 
 
 def latency(experiment: Experiment) -> dict[str, float]:

@@ -15,6 +15,7 @@ from typing import ClassVar
 import numpy as np
 
 from dadiff.errors import ConfigError
+from dadiff.experts.lqr import GaussianLaw
 from dadiff.systems import AffineSystem
 from dadiff.systems.families import LinearFamily, LinearRobots
 from dadiff.tasks.lqr import LQR, ends_layout
@@ -120,8 +121,15 @@ class Fleet(ManyRobots):
         start: np.ndarray | None = None,
     ) -> np.ndarray:
         """Each robot's optimum tau (robots, ..., d) without process noise for E (robots, ..., c); see `LQR.solve`."""
+        return self.lqr.solve(system, self._ends(system, environment), model)
+
+    def of_runs(self, system: LinearRobots, environment: np.ndarray) -> tuple[GaussianLaw, np.ndarray]:
+        """The law of each robot's own expert with process noise, and [x_init; target]: no network is told the robot."""
+        return self.lqr.law(system), self._ends(system, environment)
+
+    def _ends(self, system: LinearRobots, environment: np.ndarray) -> np.ndarray:
         ends = {name: self.condition(system).get(environment, name) for name in ("x_init", "target")}
-        return self.lqr.solve(system, ends_layout(system).pack(**ends), model)
+        return ends_layout(system).pack(**ends)
 
     def goal(self, system: LinearRobots, environment: np.ndarray) -> np.ndarray:
         """The target (robots, ..., n)."""

@@ -129,6 +129,10 @@ class LQR:
         """The Gaussian law of demonstrations given E."""
         return ClosedLoopLaw(system, self.feedback(system))
 
+    def of_runs(self, system: AffineSystem, environment: np.ndarray) -> tuple[GaussianLaw, np.ndarray]:
+        """The law of demonstrations, and E."""
+        return self.law(system), environment
+
     def sample_environments(self, system: AffineSystem, shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
         """E of shape (*shape, 2n)."""
         n = system.state_dim

@@ -156,6 +156,15 @@ class Lawful(Protocol):
 
 
 @runtime_checkable
+class Repeatable(Protocol):
+    """A task whose expert can be run anew on the robot that is planned for, since its law there is known."""
+
+    def of_runs(self, system: System, environment: np.ndarray) -> tuple[GaussianLaw, np.ndarray]:
+        """The law of the expert's runs, each robot's own, and what of E (*robots, cases, c) it depends on."""
+        ...
+
+
+@runtime_checkable
 class Continuing(Protocol):
     """A task whose expert can begin anywhere on its way: what a closed loop meets."""
 
