@@ -374,10 +374,13 @@ def every_set() -> dict[str, TrajectorySet]:
     limited = replace(SYSTEM, bounds=Bounds(-2.0, 2.0))
     learned = {kind.__name__: kind().fit(LAYOUT, SYSTEM, recording, shown) for kind in (HankelLowRank, IdentifiedSoft)}
     plain = {kind.__name__: kind().fit(LAYOUT, SYSTEM) for kind in (Inpainting, Known)}
+    learned["DoubtedManifold"] = IdentifiedSoft(features=("identity",)).fit(LAYOUT, SYSTEM, recording)
     return {**learned, **plain, "Limited": Known(bounds="enforced").fit(LAYOUT, limited)}
 
 
-@pytest.mark.parametrize("name", ["HankelLowRank", "IdentifiedSoft", "Inpainting", "Known", "Limited"])
+@pytest.mark.parametrize(
+    "name", ["HankelLowRank", "IdentifiedSoft", "DoubtedManifold", "Inpainting", "Known", "Limited"]
+)
 @pytest.mark.parametrize("enforcement", [Conditional(), Conditional("measured"), CleanEstimate()], ids=str)
 def test_every_set_and_the_estimates_law_are_in_the_file(tmp_path, name, enforcement):
     shown = TASK.demonstrations(SYSTEM, 300, np.random.default_rng(0))

@@ -184,7 +184,7 @@ def regressed(data: Transitions, features: Features, ridge: float = 0.0) -> Regr
     Phi = features(data.x, data.u)
     _check_features(Phi, ridge)
     theta, root, noise = regression(Phi, data.following - data.x, ridge)
-    return Regression(Regressed(features, theta), root_of(root, noise))
+    return Regression(Regressed(features, np.ascontiguousarray(theta)), root_of(root, noise))
 
 
 def significant(data: Transitions, features: Features, threshold: float) -> Regression:
