@@ -180,6 +180,19 @@ def _unknown(stream: IO[bytes]) -> Any:
     raise ValueError("an array of a format that holds no plain numbers")
 
 
+def check_parquet(path: Path) -> None:
+    """Refuse a table that unpacks to more than fits: a few bytes may stand for any number of equal rows.
+
+    Raises:
+        DataError: with the estimate.
+    """
+    from pyarrow.parquet import read_metadata
+
+    metadata = read_metadata(path)
+    if (size := 8 * metadata.num_rows * metadata.num_columns) > available():
+        raise DataError(f"{path}: holds {in_words(size)} when unpacked, {in_words(available())} of memory are there")
+
+
 def without_passwords(text: str) -> str:
     """Text as it may be shown: "postgresql://me:secret@host/db" becomes "postgresql://me@host/db"."""
     return PASSWORD.sub(r"\1@", text)

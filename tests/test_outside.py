@@ -109,7 +109,7 @@ def test_a_zip_that_unpacks_to_more_than_there_is(tmp_path, monkeypatch):
 
 def test_a_table_that_unpacks_to_more_than_there_is(tmp_path, monkeypatch):
     run = Results(tmp_path).write(Record("0" * 16, "x", "finished"), tables={"chain": pd.DataFrame({"a": range(1000)})})
-    monkeypatch.setattr("dadiff.store.results.available", lambda: 1e3)
+    monkeypatch.setattr("dadiff.outside.available", lambda: 1e3)
     with pytest.raises(StoreError, match=r"holds 8\.0 kB when unpacked"):
         run.table("chain")
 

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from dadiff.datasets import NpzRecordings, NpzTrajectories
+from dadiff.datasets import NpzRecordings, NpzTrajectories, recording_of
 from dadiff.datasets.excitation import check_excited, tell_held
 from dadiff.datasets.physics import mismatch
 from dadiff.errors import DataError, ExcitationError
@@ -246,6 +246,20 @@ REFUSED = {
         r"its time step is 0\.02 s, the system's 0\.1 s",
     ),
     "dt": ({"states": X, "inputs": U, "dt": np.array(0.2)}, r"its time step is 0\.2 s"),
+    "dt nan": ({"states": X, "inputs": U, "dt": np.array(np.nan)}, "array dt holds a value that is not finite"),
+    "time nan": ({"states": X, "inputs": U, "time": at(0.1 * np.arange(301), 5, np.nan)}, "time holds .* not finite"),
+    "time text": (
+        {"states": X, "inputs": U, "time": np.arange(301).astype("U4")},
+        "time holds <U4; expected real",
+    ),
+    "time short": (
+        {"states": X, "inputs": U, "time": 0.1 * np.arange(99)},
+        r"shape \(99,\); expected \(301,\)",
+    ),
+    "no time": (
+        {"states": X, "inputs": U, "time": np.full(301, np.datetime64("NaT", "s"))},
+        "time holds a value that is not finite",
+    ),
     "ends": ({"states": X, "inputs": U, "episode_ends": np.array([50, 20])}, "expected rising numbers of rows"),
     "text": ({"states": np.array([["a"]]), "inputs": U}, "expected real numbers"),
 }
@@ -323,6 +337,8 @@ def test_episodes_are_read_as_others_write_them(kind, tmp_path):
     (lambda f: f.create_group("observations").create_dataset("state", data=X), "observations is a group of state;"),
     (lambda f: f.__setitem__("observations", h5py.ExternalLink("/etc/passwd", "/")), "lies in another file"),
     (lambda f: f.create_dataset("observations", (10**9, 10**4), dtype="f8"), "observations holds .* of memory"),
+    (lambda f: f.__setitem__("observations", h5py.Empty("f8")), "observations is empty"),
+    (lambda f: f.__setitem__("episode_0", h5py.ExternalLink("/etc/passwd", "/")), "episode_0 lies in another file"),
     (lambda f: None, "has no array states or observations; found"),
 ])  # fmt: skip
 def test_hdf5_that_cannot_be_taken_is_refused(write, told, tmp_path):
@@ -348,6 +364,36 @@ def test_tables_that_cannot_be_taken_are_refused_with_the_remedy(content, told, 
     (tmp_path / "a.csv").write_text(content)
     with pytest.raises(DataError, match=rf"a\.csv: .*({told})"):
         NpzRecordings(str(tmp_path), COLUMNS).record(SYSTEM)
+
+
+ODD_TABLES = {
+    "lists of lists": ({"x": [[[1.0]]] * 9}, COLUMNS, "'x' holds lists of something else than numbers"),
+    "lists of two lengths": ({"x": [[1.0]] * 8 + [[1.0, 2.0]]}, COLUMNS, "'x' holds lists of different lengths"),
+    "lists of text": ({"x": [["a"]] * 9}, COLUMNS, "'x' holds lists of something else than numbers"),
+    "a list missing": ({"x": [[1.0]] * 8 + [None]}, COLUMNS, "'x' holds lists of"),
+    "no states": ({}, COLUMNS | {"states": []}, r"columns\.states names 0 columns; expected at least one"),
+    "two times": ({}, COLUMNS | {"time": ["x", "y"]}, r"columns\.time names 2 columns; expected one"),
+    "no episode": ({"run": [1.0] * 8 + [np.nan]}, COLUMNS | {"episode": "run"}, "row 8 belongs to no episode"),
+}
+
+
+@pytest.mark.parametrize("name", ODD_TABLES)
+def test_odd_tables_are_refused_with_column_and_reason(name, tmp_path):
+    changed, columns, told = ODD_TABLES[name]
+    pd.DataFrame(np.hstack([X[:9], U[:9]]), columns=[*"xyzw", "ax", "ay"]).rename(
+        columns={"z": "vx", "w": "vy"}
+    ).assign(**changed).to_parquet(tmp_path / "a.parquet")
+    with pytest.raises(DataError, match=rf"a\.parquet: .*{told}"):
+        NpzRecordings(str(tmp_path), columns).record(SYSTEM)
+
+
+def test_two_columns_of_one_name_and_names_on_several_levels_are_refused():
+    table = pd.DataFrame(np.hstack([X[:9], U[:9]]), columns=["x", "x", "vx", "vy", "ax", "ay"])
+    with pytest.raises(DataError, match="has several columns 'x'"):
+        recording_of([table], {"states": ["x"], "inputs": ["ax"]}, SYSTEM)
+    table.columns = pd.MultiIndex.from_product([["a"], [*"xyzwuv"]])
+    with pytest.raises(DataError, match="has no column 'x'"):
+        recording_of([table], {"states": ["x"], "inputs": ["u"]}, SYSTEM)
 
 
 def test_episodes_in_one_file_are_cut_where_they_end(tmp_path):

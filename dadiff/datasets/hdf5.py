@@ -37,7 +37,7 @@ def from_hdf5(file: Path, beside: Sequence[str] = ()) -> list[Arrays]:
     try:
         with h5py.File(regular(file), "r") as content:
             episodes = sorted((name for name in content if name.startswith("episode_")), key=_number)
-            parts = {f"{file}: {name}": content[name] for name in episodes} or {str(file): content}
+            parts = {f"{file}: {name}": _inside(content, name, str(file)) for name in episodes} or {str(file): content}
             return [_arrays(part, where, beside) for where, part in parts.items()]
     except (OSError, ValueError, KeyError, RuntimeError) as error:
         raise DataError(f"{file}: cannot be read as HDF5 ({' '.join(str(error).split())})") from error
@@ -53,7 +53,7 @@ def _arrays(group: Any, where: str, beside: Sequence[str]) -> dict[str, np.ndarr
     found = {name: _read(_inside(group, name, where), f"{where}: {name}") for name in wanted if name in group}
     flags = [np.ravel(found.pop(name)).astype(bool) for name in FLAGS if name in found]
     states = next((found[name] for name in STATES if name in found), None)
-    if flags and states is not None and len(states) == len(flags[0]):
+    if flags and states is not None and states.ndim > 1 and {len(states)} == {len(flag) for flag in flags}:
         ends = np.flatnonzero(np.logical_or.reduce(flags)) + 1
         found[ENDS] = np.union1d(ends, [len(states)])
     return found
@@ -63,13 +63,14 @@ def _inside(group: Any, name: str, where: str) -> Any:
     """A member of the file itself.
 
     Raises:
-        DataError: if it lies in another file, by a link, a virtual array or external storage.
+        DataError: if it lies in another file, by links, a virtual array or external storage.
     """
     import h5py
 
     if not isinstance(group.get(name, getlink=True), h5py.ExternalLink):
         node = group[name]
-        if not isinstance(node, h5py.Dataset) or not (node.is_virtual or node.external):
+        elsewhere = isinstance(node, h5py.Dataset) and (node.is_virtual or node.external)
+        if not elsewhere and node.file.filename == group.file.filename:
             return node
     raise DataError(f"{where}: {name} lies in another file; write one file that holds what it needs")
 
@@ -83,6 +84,8 @@ def _read(node: Any, where: str) -> np.ndarray:
     if not hasattr(node, "dtype"):
         inside = ", ".join(node)
         raise DataError(f"{where} is a group of {inside}; dadiff takes one array: write out the one that is the state")
+    if node.shape is None:
+        raise DataError(f"{where} is empty; expected an array of numbers")
     if (size := node.size * node.dtype.itemsize) > available():
         raise DataError(f"{where} holds {in_words(size)}, {in_words(available())} of memory are there")
     return np.asarray(node[()])

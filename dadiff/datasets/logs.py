@@ -107,9 +107,9 @@ def runs_of(arrays: Arrays, where: str, system: System, beside: Sequence[str] = 
         beside: names of arrays of n numbers for the file, for each run or for each state; those that are there follow
             the states as n more columns each.
     """
-    stamps = _time_stamps(where, arrays, system.time_step)
     states = _plain(where, arrays, STATES, system.state_dim)
     inputs = _plain(where, arrays, INPUTS, system.input_dim)
+    stamps = _time_stamps(where, arrays, (states.shape[-2], inputs.shape[-2]), system.time_step)
     said = [int(end) for end in np.ravel(_finite(where, ENDS, arrays[ENDS]))] if ENDS in arrays else []
     more = [_a_state(where, name, arrays, states, said) for name in beside if name in arrays]
     together = np.concatenate([states, *more], axis=-1)
@@ -155,9 +155,9 @@ def _plain(where: str, arrays: Arrays, names: Sequence[str], size: int) -> np.nd
 def _finite(where: str, name: str, values: np.ndarray) -> np.ndarray:
     """Numbers as float64, every one of them finite."""
     values = _real(where, name, values)
-    if (odd := np.argwhere(~np.isfinite(values))).size:
+    if not np.isfinite(values).all():
         cut = "cut there into episodes (episode_ends), without that row"
-        at = f", first in row {odd[0][-2]}; {cut}" if values.ndim > 1 else ""
+        at = f", first in row {np.argwhere(~np.isfinite(values))[0][-2]}; {cut}" if values.ndim > 1 else ""
         raise DataError(f"{where}: array {name} holds a value that is not finite{at}")
     return values
 
@@ -231,29 +231,36 @@ def _episodes(where: str, runs: list[Run], places: list[int]) -> list[Run]:
     return [(x, u) for x, u in cut if len(u)]
 
 
-def _time_stamps(where: str, arrays: Arrays, time_step: float | None) -> np.ndarray | None:
+def _time_stamps(where: str, arrays: Arrays, rows: Sequence[int], time_step: float | None) -> np.ndarray | None:
     """The time stamps (rows,), if there are any; refuses another time step than the system's, says uneven ones.
 
     Raises:
-        DataError: if the usual step is not the system's.
+        DataError: if there are not as many as rows of states or inputs, or the usual step is not the system's.
     """
-    stamps = next((np.ravel(arrays[name]) for name in TIMES if name in arrays), None)
-    said = next(
-        (float(step) for name in STEPS if name in arrays for step in _finite(where, name, arrays[name]).flat), None
-    )
-    if stamps is not None and stamps.dtype.kind in "fiu" and len(stamps) > 1:
-        stamps = stamps.astype(np.float64)
-        steps = np.diff(stamps)
+    stamps = next((_stamps(where, name, arrays[name], rows) for name in TIMES if name in arrays), None)
+    told = [np.ravel(_finite(where, name, arrays[name])) for name in STEPS if name in arrays]
+    told += [np.ravel(np.diff(stamps))] if stamps is not None else []
+    for steps in filter(len, told):
         usual = float(np.median(steps))
-        said = usual if said is None else said
         odd = np.abs(steps - usual) > UNEVEN * abs(usual)
         if (odd & (steps > 0) & (steps <= JUMP * usual)).any():
             log.warning("%s: its time stamps are uneven, %.3g to %.3g s apart", where, steps.min(), steps.max())
-    if said is not None and time_step is not None and abs(said - time_step) > 0.01 * time_step:
-        units = [f", in {name}?" for k, name in UNITS_OF_TIME.items() if 0.99 < said / time_step / k < 1.01]
-        told = f"its time step is {said:.4g} s, the system's {time_step:.4g} s{units[0] if units else ''}"
-        raise DataError(f"{where}: {told}; sample it anew, or mend one")
-    return stamps if stamps is None or stamps.dtype.kind == "f" else None
+        if time_step is not None and abs(usual - time_step) > 0.01 * time_step:
+            units = [f", in {name}?" for k, name in UNITS_OF_TIME.items() if 0.99 < usual / time_step / k < 1.01]
+            found = f"its time step is {usual:.4g} s, the system's {time_step:.4g} s{units[0] if units else ''}"
+            raise DataError(f"{where}: {found}; sample it anew, or mend one")
+    return stamps if stamps is not None and stamps.ndim == 1 else None
+
+
+def _stamps(where: str, name: str, values: np.ndarray, rows: Sequence[int]) -> np.ndarray:
+    """Time stamps (rows,), or (runs, rows) of runs along a batch axis, in seconds."""
+    if values.dtype.kind == "M":
+        values = np.where(np.isnat(values), np.nan, values.astype("datetime64[ns]").astype(np.int64) / 1e9)
+    values = _finite(where, name, values)
+    values = values[:, 0] if values.ndim == 2 and values.shape[1] == 1 else values
+    if not values.shape or values.ndim > 2 or values.shape[-1] not in rows:
+        raise DataError(f"{where}: array {name} has shape {values.shape}; expected ({rows[0]},), one for each state")
+    return values
 
 
 def side_by_side(runs: Sequence[Run]) -> tuple[np.ndarray, np.ndarray]:

@@ -14,7 +14,7 @@ import numpy as np
 
 from dadiff.errors import DataError
 from dadiff.memory import available, in_words
-from dadiff.outside import regular
+from dadiff.outside import check_parquet, regular
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -31,6 +31,8 @@ LEROBOT = {
 PARTS = ("states", "inputs", "episode", "time", "target")
 TARGET, START = "target_state", "initial_state"
 """What demonstrations may have besides: where they should go, and where they say that they begin."""
+
+MOST_NAMED = 30
 
 Columns = Mapping[str, str | Sequence[str]]
 Arrays = Mapping[str, np.ndarray]
@@ -50,8 +52,10 @@ def from_table(file: Path, columns: Columns | None) -> list[Arrays]:
 
 def arrays_of_table(table: pd.DataFrame, columns: Columns | None, where: str) -> list[Arrays]:
     """As `from_table`, of a data frame."""
-    table = table.rename(columns=lambda name: str(name).strip().lstrip("#").strip())
+    table = table.set_axis([str(name).strip().lstrip("#").strip() for name in table.columns], axis=1)
     chosen = _chosen(table, columns, where)
+    if "episode" in chosen and (lost := table[chosen["episode"]].isna().any(axis=1)).any():
+        raise DataError(f"{where}: row {int(lost.argmax())} belongs to no episode; take it out, or say to which")
     parts = [part for _, part in table.groupby(chosen["episode"], sort=False)] if "episode" in chosen else [table]
     return [_arrays(part, chosen, where) for part in parts]
 
@@ -67,15 +71,25 @@ def _chosen(table: pd.DataFrame, columns: Columns | None, where: str) -> dict[st
     if not columns or {"states", "inputs"} - set(columns):
         raise DataError(
             f"{where}: say which columns are which: recording.columns={{states: [x, y], inputs: [u]}}, of "
-            f"demonstrations dataset.columns; found {', '.join(table.columns)}"
+            f"demonstrations dataset.columns; found {_few(table.columns)}"
         )
     if odd := set(columns) - set(PARTS):
         raise DataError(f"{where}: columns has '{min(odd)}'; expected {', '.join(PARTS)}")
     chosen = {part: [names] if isinstance(names, str) else list(names) for part, names in columns.items()}
-    for names in chosen.values():
+    for part, names in chosen.items():
+        if not names or (part == "time" and len(names) > 1):
+            expected = "one" if part == "time" else "at least one"
+            raise DataError(f"{where}: columns.{part} names {len(names)} columns; expected {expected}")
         if missing := [name for name in names if name not in table.columns]:
-            raise DataError(f"{where}: has no column {missing[0]!r}; found {', '.join(table.columns)}")
+            raise DataError(f"{where}: has no column {missing[0]!r}; found {_few(table.columns)}")
+        if twice := [name for name in names if list(table.columns).count(name) > 1]:
+            raise DataError(f"{where}: has several columns {twice[0]!r}; give each a name of its own")
     return chosen
+
+
+def _few(names: Sequence[str]) -> str:
+    """Names for a message, the first ones of many."""
+    return ", ".join(names[:MOST_NAMED]) + (f", and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else "")
 
 
 def _arrays(table: pd.DataFrame, chosen: Mapping[str, Sequence[str]], where: str) -> dict[str, np.ndarray]:
@@ -98,9 +112,7 @@ def _numbers(table: pd.DataFrame, name: str, where: str) -> np.ndarray:
 
     values = table[name]
     if len(values) and isinstance(values.iloc[0], list | tuple | np.ndarray):
-        if len({len(row) for row in values}) > 1:
-            raise DataError(f"{where}: column {name!r} holds lists of different lengths; expected one length")
-        return np.stack([np.asarray(row, dtype=np.float64) for row in values])
+        return _lists(values, f"{where}: column {name!r}")
     if values.dtype.kind not in "fiub":
         numbers = pd.to_numeric(values, errors="coerce")
         if (odd := numbers.isna() & values.notna()).any():
@@ -110,15 +122,26 @@ def _numbers(table: pd.DataFrame, name: str, where: str) -> np.ndarray:
     return values.to_numpy(dtype=np.float64)[:, None]
 
 
+def _lists(values: pd.Series, what: str) -> np.ndarray:
+    """A column of lists of numbers as (rows, k)."""
+    try:
+        rows = [np.asarray(row, dtype=np.float64) for row in values]
+    except (ValueError, TypeError) as error:
+        raise DataError(f"{what} holds lists of something else than numbers ({error})") from error
+    if {row.ndim for row in rows} != {1} or len({len(row) for row in rows}) > 1:
+        raise DataError(f"{what} holds lists of different lengths, or of lists; expected numbers, as many in each row")
+    return np.stack(rows)
+
+
 def _seconds(table: pd.DataFrame, name: str, where: str) -> np.ndarray:
-    """Time stamps (rows,): numbers as they are, dates as seconds."""
+    """Time stamps (rows,): numbers as they are, or dates."""
     import pandas as pd
 
     values = table[name]
     if values.dtype.kind in "fiu":
         return values.to_numpy(dtype=np.float64)
     try:
-        return pd.to_datetime(values).to_numpy().astype("datetime64[ns]").astype(np.int64) / 1e9
+        return pd.to_datetime(values).to_numpy().astype("datetime64[ns]")
     except (ValueError, TypeError) as error:
         raise DataError(f"{where}: column {name!r} holds no times ({' '.join(str(error).split())})") from error
 
@@ -126,11 +149,12 @@ def _seconds(table: pd.DataFrame, name: str, where: str) -> np.ndarray:
 def _read(file: Path) -> pd.DataFrame:
     import pandas as pd
 
-    if (size := file.stat().st_size) > available():
-        raise DataError(f"{file}: holds {in_words(size)}, {in_words(available())} of memory are there")
     try:
         if file.suffix == ".parquet":
+            check_parquet(file)
             return pd.read_parquet(file)
+        if (size := file.stat().st_size) > available():
+            raise DataError(f"{file}: holds {in_words(size)}, {in_words(available())} of memory are there")
         separator, decimal = _dialect(file)
         return pd.read_csv(file, sep=separator, decimal=decimal, encoding="utf-8-sig")
     except (OSError, ValueError, KeyError) as error:

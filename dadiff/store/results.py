@@ -17,8 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dadiff.errors import DataError, LockedError, StoreError
-from dadiff.memory import available, in_words
-from dadiff.outside import npz, passwords_removed
+from dadiff.outside import check_parquet, npz, passwords_removed
 from dadiff.store.files import (
     broken_seals,
     checksum,
@@ -138,7 +137,7 @@ def read_table(folder: Path, name: str) -> pd.DataFrame:
     import pandas as pd
 
     with _sound(path := folder / f"{name}.parquet"):
-        _check_table(path)
+        check_parquet(path)
         return pd.read_parquet(path, use_threads=False)  # tables are small: threads take longer to wake
 
 
@@ -166,18 +165,11 @@ def _sound(path: Path) -> Iterator[None]:
     _check_seal(path)
     try:
         yield
+    except DataError as error:
+        raise StoreError(str(error)) from error
     except (OSError, ValueError, KeyError) as error:
         text = " ".join(str(error).split())
         raise StoreError(f"{path}: is damaged ({text}); run it again with force=true") from error
-
-
-def _check_table(path: Path) -> None:
-    """Refuse a table that unpacks to more than fits: a few bytes may stand for any number of equal rows."""
-    from pyarrow.parquet import read_metadata
-
-    metadata = read_metadata(path)
-    if (size := 8 * metadata.num_rows * metadata.num_columns) > available():
-        raise StoreError(f"{path}: holds {in_words(size)} when unpacked, {in_words(available())} of memory are there")
 
 
 class Results:
