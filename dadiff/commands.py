@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import sys
@@ -12,6 +13,7 @@ from pathlib import Path
 from dadiff.errors import DadiffError
 
 FAILED, INTERRUPTED, UNHEARD = 1, 130, 141
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 def reported(program: str, work: Callable[[], int | None]) -> int:
@@ -52,5 +54,6 @@ def in_one_line(error: BaseException) -> str:
         return f"out of memory {error}".strip()
     if isinstance(error, OSError) and error.strerror:
         place = f"{error.filename}: " if error.filename else ""
-        return f"{place}{error.strerror}"
+        remedy = "; make room, and the same command goes on" if error.errno in FULL else ""
+        return f"{place}{error.strerror}{remedy}"
     return " ".join(str(error).split())

@@ -6,6 +6,7 @@ Nothing here waits for a pipe or a device, follows aliases without end, or makes
 from __future__ import annotations
 
 import hashlib
+import json
 import math
 import re
 import stat
@@ -72,6 +73,18 @@ def text_of(path: Path) -> str:
         raise DataError(f"{path}: is no text ({error})") from error
 
 
+def json_of(path: Path) -> Any:
+    """The plain data in a json file.
+
+    Raises:
+        DataError: if it cannot be read, or is no json.
+    """
+    try:
+        return json.loads(text_of(path))
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"{path}: not readable as json: {error}") from error
+
+
 def yaml_of(path: Path) -> Any:
     """The plain data in a yaml file.
 
@@ -84,7 +97,7 @@ def yaml_of(path: Path) -> Any:
         node = yaml.compose(text_of(path), Loader=yaml.SafeLoader)
         check_aliases(node, str(path))
         return yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, RecursionError, ValueError) as error:
+    except (yaml.YAMLError, RecursionError, ValueError, TypeError) as error:
         raise DataError(f"{path}: not readable as yaml: {' '.join(str(error).split())}") from error
 
 

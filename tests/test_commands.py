@@ -32,9 +32,9 @@ def raising(error: BaseException) -> Callable[[], None]:
         (
             OSError(errno.ENOSPC, "No space left on device", "/disk/x"),
             1,
-            "dadiff: error: /disk/x: No space left on device",
+            "dadiff: error: /disk/x: No space left on device; make room, and the same command goes on",
         ),
-        (OSError(errno.ENOSPC, "No space left on device"), 1, "dadiff: error: No space left on device"),
+        (OSError(errno.EDQUOT, "Quota"), 1, "dadiff: error: Quota; make room, and the same command goes on"),
         (PermissionError(errno.EACCES, "Permission denied", "x"), 1, "dadiff: error: x: Permission denied"),
         (MemoryError(), 1, "dadiff: error: out of memory"),
         (KeyboardInterrupt(), 130, "dadiff: interrupted; the same command goes on from what is stored"),

@@ -19,10 +19,11 @@ from dadiff import memory
 from dadiff.datasets import NpzRecordings, NpzTrajectories
 from dadiff.datasets.environments import load_environments
 from dadiff.denoisers import RecordingMLP
-from dadiff.errors import ConfigError, DadiffError, DataError, StoreError
-from dadiff.outside import digest_of, npz, spreadsheet_safe, text_of, without_passwords, yaml_of
+from dadiff.errors import CheckpointError, ConfigError, DadiffError, DataError, StoreError
+from dadiff.outside import digest_of, json_of, npz, spreadsheet_safe, text_of, without_passwords, yaml_of
 from dadiff.running.parts import Parts
 from dadiff.store import Record, Results, Sweep, Sweeps
+from dadiff.store.planners import read_file
 from dadiff.systems import double_integrator
 from dadiff.tasks import LQR
 from dadiff.tasks.obstacles import Obstacles
@@ -192,3 +193,27 @@ def test_a_cell_that_a_spreadsheet_would_take_for_a_formula_is_marked_as_text(te
     assert [spreadsheet_safe(value) for value in (-1.5, "lqr/a=1", "", None)] == [-1.5, "lqr/a=1", "", None]
     row = next(csv.reader(io.StringIO(f'"{spreadsheet_safe(text)}"\n', newline="")))
     assert row == [f"'{text}"]
+
+
+@pytest.mark.parametrize("harm", ["encrypted", "odd method"])
+def test_a_planner_that_zipfile_cannot_unpack_is_told_in_a_line(tmp_path, harm):
+    path = tmp_path / "robot.zip"
+    with zipfile.ZipFile(path, "w") as file:
+        file.writestr("planner.json", "{}")
+        file.writestr("arrays.safetensors", b"")
+    content, at = bytearray(path.read_bytes()), {"encrypted": (6, 8, 1), "odd method": (8, 10, 97)}[harm]
+    for mark, offset in ((b"PK\x03\x04", at[0]), (b"PK\x01\x02", at[1])):
+        place = content.find(mark)
+        while place >= 0:
+            content[place + offset] |= at[2]
+            place = content.find(mark, place + 4)
+    path.write_bytes(bytes(content))
+    with pytest.raises(CheckpointError, match=r"robot\.zip: is (no planner of dadiff, or damaged|compressed)"):
+        read_file(path)
+
+
+@pytest.mark.parametrize(("text", "told"), [("{", "not readable as json"), ("[" * 100_000, "not readable as json")])
+def test_json_that_is_none_is_told_in_a_line(tmp_path, text, told):
+    (tmp_path / "a.json").write_text(text)
+    with pytest.raises(DataError, match=rf"a\.json: {told}"):
+        json_of(tmp_path / "a.json")

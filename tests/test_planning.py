@@ -215,7 +215,11 @@ FILES = {
         lambda d: d["planner"]["denoiser"]["fields"]["layout"]["fields"].update(horizon=10**9)
     ),
     "its denoiser takes E of 4 entries, its task 8": changed(_shorter_condition),
-    "lacks a part of a planner .*LQR": changed(lambda d: d["planner"].update(system=d["planner"]["task"])),
+    "schedule of its Planner is 1e9, which is no Schedule": changed(lambda d: d["planner"].update(schedule="1e9")),
+    "holds .'number': 'x'., which is no part of a planner": changed(
+        lambda d: d["planner"].update(schedule={"number": "x"})
+    ),
+    "system of its Planner is LQR": changed(lambda d: d["planner"].update(system=d["planner"]["task"])),
     "robot.zip: is no planner of dadiff; write": lambda path: described_as(path, [1, 2]),
     "damaged .maximum recursion": lambda path: described_as(path, nested(100_000)),
     "tensor network": changed(lambda d: d["planner"]["denoiser"]["fields"]["recipe"]["fields"].update(width=8)),
@@ -289,7 +293,7 @@ WRONG = [
     (["--x-init", "a,b", "--target", "0,0,0,0"], "--x-init is 'a,b'; expected numbers"),
     (["--x-init"], "expected the fields of the condition as --name numbers"),
     (["--samples", "0", "--x-init", "0,0,0,0", "--target", "0,0,0,0"], "--samples is 0"),
-    (["--condition", "nowhere.yaml"], "not readable as yaml"),
+    (["--condition", "nowhere.yaml"], "cannot be read"),
 ]
 
 

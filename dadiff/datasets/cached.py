@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from dadiff.outside import npz
+from dadiff.outside import json_of, npz
 from dadiff.tasks import Cases, Demonstrations
 
 
@@ -24,4 +24,4 @@ def save_data(folder: Path, draw: Callable[[], Demonstrations | Cases]) -> None:
 def load_data(folder: Path) -> dict[str, Any]:
     """The fields that `save_data` wrote: all but the layout of E, which is the task's to say."""
     with npz(folder / "data.npz") as data:
-        return {**data, "notes": json.loads((folder / "notes.json").read_text())}
+        return {**data, "notes": json_of(folder / "notes.json")}

@@ -71,7 +71,7 @@ def _chosen(table: pd.DataFrame, columns: Columns | None, where: str) -> dict[st
     if not columns or {"states", "inputs"} - set(columns):
         raise DataError(
             f"{where}: say which columns are which: recording.columns={{states: [x, y], inputs: [u]}}, of "
-            f"demonstrations dataset.columns; found {_few(table.columns)}"
+            f"demonstrations dataset.columns; found {_few(list(table.columns))}"
         )
     if odd := set(columns) - set(PARTS):
         raise DataError(f"{where}: columns has '{min(odd)}'; expected {', '.join(PARTS)}")
@@ -81,7 +81,7 @@ def _chosen(table: pd.DataFrame, columns: Columns | None, where: str) -> dict[st
             expected = "one" if part == "time" else "at least one"
             raise DataError(f"{where}: columns.{part} names {len(names)} columns; expected {expected}")
         if missing := [name for name in names if name not in table.columns]:
-            raise DataError(f"{where}: has no column {missing[0]!r}; found {_few(table.columns)}")
+            raise DataError(f"{where}: has no column {missing[0]!r}; found {_few(list(table.columns))}")
         if twice := [name for name in names if list(table.columns).count(name) > 1]:
             raise DataError(f"{where}: has several columns {twice[0]!r}; give each a name of its own")
     return chosen

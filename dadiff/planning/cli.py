@@ -9,6 +9,7 @@ from typing import Any
 
 from dadiff.commands import reported
 from dadiff.errors import DataError
+from dadiff.outside import yaml_of
 
 DESCRIPTION = """Plans of a trained planner, for one condition.
 
@@ -87,12 +88,7 @@ def _numbers(name: str, value: str) -> list[float]:
 
 
 def _from_yaml(path: Path) -> dict[str, Any]:
-    import yaml
-
-    try:
-        content = yaml.safe_load(path.read_text())
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise DataError(f"{path}: not readable as yaml: {' '.join(str(error).split())}") from error
+    content = yaml_of(path)
     if not isinstance(content, dict) or not all(isinstance(name, str) for name in content):
         raise DataError(f"{path}: expected a mapping with the fields of a condition; found {type(content).__name__}")
     return content

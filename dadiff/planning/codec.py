@@ -11,7 +11,9 @@ import inspect
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, is_dataclass
-from typing import Any
+from functools import cache
+from types import UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
@@ -87,7 +89,7 @@ class Decoder:
         if not isinstance(plain, dict):
             return plain
         match plain:
-            case {"number": str(text)}:
+            case {"number": "nan" | "inf" | "-inf" as text}:
                 return float(text)
             case {"array": str(name)} if name in self.arrays:
                 return self.arrays[name]
@@ -103,6 +105,7 @@ class Decoder:
 
     def _made(self, name: str, given: dict[str, Any]) -> Any:
         made = self.class_of(name)
+        self.check(made, given)
         try:
             return made(**given)
         except DadiffError as error:
@@ -111,6 +114,19 @@ class Decoder:
             raise CheckpointError(
                 f"{self.where}: its {made.__name__} does not fit this version ({error}); save it again"
             ) from error
+
+    def check(self, made: type, given: Mapping[str, Any]) -> None:
+        """Refuse values that are none of the types that a dataclass annotates.
+
+        Raises:
+            CheckpointError: naming the field.
+        """
+        for name, hint in _hints(made).items():
+            if name in given and not _fits(given[name], hint):
+                raise CheckpointError(
+                    f"{self.where}: {name} of its {made.__name__} is {str(given[name])[:60]}, which is no "
+                    f"{getattr(hint, '__name__', str(hint))}; save it again"
+                )
 
     def class_of(self, name: str) -> type:
         """The frozen dataclass of a stored name, "dadiff.systems.linear:Linear".
@@ -133,6 +149,27 @@ class Decoder:
         if not (isinstance(found, type) and is_dataclass(found) and found.__module__ == module):
             raise CheckpointError(f"{self.where}: names {name[:80]}, which is no dataclass of that module")
         return found
+
+
+@cache
+def _hints(made: type) -> dict[str, Any]:
+    """The types of a dataclass's fields; of one that names types which are there for checkers only, none."""
+    try:
+        return get_type_hints(made)
+    except NameError:
+        return {}
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    """Whether a value is of a type; of containers, whose parts are checked where they are made, nothing is said."""
+    if get_origin(hint) in (Union, UnionType):
+        return any(_fits(value, part) for part in get_args(hint))
+    if get_origin(hint) is Literal:
+        return value in get_args(hint)
+    if hint in (int, float):
+        return isinstance(value, (int, hint)) and not isinstance(value, bool)
+    is_open = getattr(hint, "_is_protocol", False) and not getattr(hint, "_is_runtime_protocol", False)
+    return isinstance(value, hint) if isinstance(hint, type) and not is_open else True
 
 
 def name_of(kind: type) -> str:

@@ -81,6 +81,7 @@ def planner_of(
     decode = Decoder(arrays, where, components)
     try:
         parts = {name: decode(plain) for name, plain in description["planner"].items()}
+        decode.check(Planner, {name: part for name, part in parts.items() if name != "denoiser"})
         made = parts.pop("denoiser")
         _check_sizes(made, parts, where)
         denoiser = made.build(device)

@@ -25,6 +25,7 @@ from dadiff.diffusion.estimate import Estimate
 from dadiff.diffusion.samplers import Sampler
 from dadiff.diffusion.schedule import Schedule
 from dadiff.errors import DataError, NotApplicableError, ShapeError
+from dadiff.memory import check_fits
 from dadiff.planning.plans import Plans
 from dadiff.randomness import torch_generator
 from dadiff.systems.system import System
@@ -123,8 +124,10 @@ class Planner:
 
         Raises:
             DataError: if a field of E is missing, not known, or unusable, or no plan is asked for.
+            ConfigError: if they do not fit into memory.
             ShapeError: if E, or the plans to begin from, have another shape.
         """
+        check_fits(24.0 * samples * self.layout.size, f"plan: samples={samples} of {self.layout.size} numbers")
         lead, E = self._flat(self._condition(environment, fields), samples)
         generator = torch_generator(seed, "sampling noise")
         begin = None if start is None else self._begun(start, (*lead, samples)).reshape(*E.shape[:-1], -1)

@@ -19,10 +19,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from dadiff.errors import ConfigError
 from dadiff.folders import shipped
+from dadiff.outside import yaml_of
 from dadiff.reporting import figures, tables
 
 FOLDER = shipped("reports")
@@ -114,10 +113,10 @@ def load(name: str) -> Definition:
     if not path.is_file():
         raise ConfigError(f"no report definition {name!r}; found {', '.join(names())} in {FOLDER}")
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        content = yaml_of(path)
         parts = [[Item(**item) for item in content.pop(kind, [])] for kind in ("figures", "tables")]
         return Definition(name=path.stem, figures=parts[0], tables=parts[1], **content)
-    except (TypeError, AttributeError, yaml.YAMLError) as error:
+    except (TypeError, AttributeError) as error:
         raise ConfigError(f"{path}: {error}; expected the keys of a report definition") from None
 
 

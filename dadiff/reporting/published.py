@@ -7,13 +7,13 @@ A published folder holds `report.json`, of this format or the one before, and `c
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from dadiff.errors import StoreError
+from dadiff.outside import json_of
 from dadiff.reporting.claims import Claim
 from dadiff.reporting.definitions import load, names
 from dadiff.reporting.labels import column_name, column_value
@@ -34,7 +34,9 @@ def read(folder: Path) -> dict[str, Any]:
     path = folder / "report.json"
     if not path.is_file():
         raise StoreError(f"{folder}: holds no report.json; publish a report there with dadiff-report --publish")
-    content: dict[str, Any] = json.loads(path.read_text("utf-8"))
+    content: dict[str, Any] = json_of(path)
+    if not isinstance(content, dict) or not isinstance(content.get("format"), int):
+        raise StoreError(f"{path}: is no report of dadiff, or damaged; write it again with dadiff-report")
     if content["format"] > FORMAT:
         raise StoreError(f"{path}: has format {content['format']}, this version reads up to {FORMAT}; update dadiff")
     return content

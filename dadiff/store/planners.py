@@ -18,7 +18,8 @@ from safetensors import SafetensorError
 from safetensors.numpy import load as read_arrays
 from safetensors.numpy import save as write_arrays
 
-from dadiff.errors import CheckpointError
+from dadiff.errors import CheckpointError, DataError
+from dadiff.outside import UNREADABLE, json_of, regular
 from dadiff.store.cache import Cache
 
 DESCRIPTION, ARRAYS, MODEL = "planner.json", "arrays.safetensors", "model.safetensors"
@@ -31,9 +32,16 @@ def pack(folder: Path, path: Path) -> Path | None:
     Raises:
         CheckpointError: if what the folder holds is damaged, or the place cannot be written to.
     """
-    if not (folder / DESCRIPTION).is_file() or "unavailable" in json.loads((folder / DESCRIPTION).read_bytes()):
+    if not (folder / DESCRIPTION).is_file() or "unavailable" in _description(folder):
         return None
     return write_file(path, *read_folder(folder))
+
+
+def _description(folder: Path) -> dict[str, Any]:
+    content = json_of(folder / DESCRIPTION)
+    if not isinstance(content, dict):
+        raise CheckpointError(f"{folder}: the planner in it is a {type(content).__name__}, which is none of dadiff's")
+    return content
 
 
 def write_file(path: Path, description: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Path:
@@ -64,14 +72,16 @@ def read_folder(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
             f"{path}: holds no {DESCRIPTION}; it is no run of a plan that can be loaded, or an old one"
         )
     try:
-        description = json.loads((path / DESCRIPTION).read_bytes())
+        description = _description(path)
         if reason := description.get("unavailable"):
             raise CheckpointError(f"{path}: cannot be loaded as a planner: {str(reason)[:300]}")
-        arrays = read_arrays((path / ARRAYS).read_bytes())
+        arrays = read_arrays(regular(path / ARRAYS).read_bytes())
         if (key := description.get("weights")) is None:
             return description, arrays
         return description, arrays | {WEIGHTS + name: a for name, a in _model(path, key).items()}
-    except (json.JSONDecodeError, UnicodeDecodeError, SafetensorError, AttributeError, OSError) as error:
+    except (DataError, SafetensorError, OSError) as error:
+        if isinstance(error, CheckpointError):
+            raise
         raise CheckpointError(
             f"{path}: the planner in it is damaged ({error}); run it again with force=true"
         ) from error
@@ -83,7 +93,7 @@ def _model(path: Path, key: object) -> dict[str, np.ndarray]:
     file = Cache(path.absolute().parent.parent).folder("denoiser", key) / MODEL
     if not file.is_file():
         raise CheckpointError(f"{path}: its trained denoiser {key} is no longer in the cache; run it again")
-    return dict(read_arrays(file.read_bytes()))
+    return dict(read_arrays(regular(file).read_bytes()))
 
 
 def read_file(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -98,8 +108,7 @@ def read_file(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         with zipfile.ZipFile(path) as file:
             _check_entries(file, path)
             return json.loads(file.read(DESCRIPTION)), read_arrays(file.read(ARRAYS))
-    except (zipfile.BadZipFile, json.JSONDecodeError, UnicodeDecodeError, SafetensorError, KeyError, OSError,
-            RecursionError) as error:  # fmt: skip
+    except (*UNREADABLE, SafetensorError, KeyError) as error:
         raise CheckpointError(f"{path}: is no planner of dadiff, or damaged ({error})") from error
 
 

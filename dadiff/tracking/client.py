@@ -149,8 +149,9 @@ def refused(uri: str) -> Iterator[None]:
             f"pip install 'dadiff[{extra}]'"
         ) from error
     except failures() as error:
+        remedy = "make room" if "disk is full" in str(error) or "No space left" in str(error) else "mend tracking.uri"
         raise StoreError(
-            f"tracking: the MLflow store {without_passwords(uri)} refuses ({first_line(error)}); mend tracking.uri"
+            f"tracking: the MLflow store {without_passwords(uri)} refuses ({first_line(error)}); {remedy}"
         ) from error
 
 

@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dadiff.outside import spreadsheet_safe
+from dadiff.outside import json_of, spreadsheet_safe
 from dadiff.store import DONE, Cache, Results, StoredRun, Sweep, Sweeps
 from dadiff.store.cache import MANIFEST
 from dadiff.store.files import checksum, read_json
@@ -243,7 +243,7 @@ def sweep_content(output_dir: Path | str, name: str) -> Content:
 def _found(output_dir: Path | str, name: str) -> list[str]:
     """The sentences of the sweep's report, if there is one."""
     path = Path(output_dir) / "reports" / name / "report.json"
-    return [str(sentence) for sentence in json.loads(path.read_text()).get("sentences", [])] if path.is_file() else []
+    return [str(sentence) for sentence in json_of(path).get("sentences", [])] if path.is_file() else []
 
 
 def results_table(sweep: Sweep, results: Results) -> pd.DataFrame:
