@@ -71,11 +71,11 @@ def overrides_first(arguments: list[str]) -> list[str]:
 
 def main() -> None:
     """Entry point."""
-    settle()
     sys.argv[1:] = overrides_first(sys.argv[1:])
     given = get_args_parser().parse_args(sys.argv[1:])
     if given.help:
         raise SystemExit(reported("dadiff", lambda: print(manual.text(given.config_dir))))
+    settle()
     trust(components_named(given.overrides))
     raise SystemExit(
         reported("dadiff", lambda: check_what_is_printed(sys.argv[1:])) or reported("dadiff", _application)

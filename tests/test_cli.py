@@ -133,7 +133,7 @@ def test_a_bad_file_is_named(dadiff, tmp_path):
         (tmp_path / "mine" / part).mkdir(parents=True)
         np.savez(tmp_path / "mine" / part / "a.npz", states=np.full((31, 4), np.nan))
     line = refused(dadiff(*TINY[:3], *TINY[6:], "dataset=npz", "dataset.path=mine"))
-    assert line.endswith("a.npz: array states holds a value that is not finite")
+    assert "a.npz: array states holds a value that is not finite" in line
 
 
 @pytest.mark.slow
