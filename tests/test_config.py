@@ -60,6 +60,13 @@ def test_defaults_written_out_or_left_out_are_the_same():
     assert build(short, "projector") == build(long, "projector") == Known()
 
 
+def test_what_no_yaml_can_hold_is_told_with_what_can_make_it():
+    told = refused(lambda: build({"_target_": "dadiff.systems.Linear", "A": [[1]], "B": [[1]]}, "system"))
+    assert told.startswith(
+        "system: A is [[1]]: input should be an instance of ndarray; no yaml holds one: let _target_"
+    )
+
+
 @pytest.mark.parametrize(
     ("override", "message"),
     [

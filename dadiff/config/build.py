@@ -22,6 +22,7 @@ from dadiff.config.protocols import check_component
 from dadiff.errors import ConfigError
 
 TARGET = "_target_"
+MADE = "; no yaml holds one: let _target_ name a function that makes it, such as dadiff.systems.inline of matrices"
 STRICT = ConfigDict(strict=True, arbitrary_types_allowed=True)
 
 
@@ -128,4 +129,5 @@ def _typed(value: Any, hint: Any, where: str) -> Any:
         return _adapter(hint).validate_python(value)
     except ValidationError as error:
         first = error.errors()[0]
-        raise ConfigError(f"{where} is {first['input']!r}: {first['msg'][0].lower()}{first['msg'][1:]}") from error
+        told = f"{where} is {first['input']!r}: {first['msg'][0].lower()}{first['msg'][1:]}"
+        raise ConfigError(told + (MADE if first["type"] == "is_instance_of" else "")) from error
