@@ -34,12 +34,11 @@ from dadiff.store.names import sweep_name
 class SweepLauncher(Launcher):
     """A subclass says with `pool` what runs the jobs; all else is the same for every launcher.
 
-    Args:
+    Attributes:
         sweep: its name; None for the one that it was chosen by, or one made from its cells.
     """
 
-    def __init__(self, sweep: str | None) -> None:
-        self.sweep = sweep
+    sweep: str | None
 
     @abstractmethod
     def pool(self, run: SweepRun, lease: Lease) -> Pool[Any]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from dadiff.launching.launcher import SweepLauncher
 from dadiff.launching.process_pool import ProcessPool
 from dadiff.launching.sweep import SweepRun
@@ -14,12 +16,14 @@ PRELOAD = (
 """What most jobs use; not MLflow, which the launcher alone talks to."""
 
 
+@dataclass(eq=False)
 class ProcessesLauncher(SweepLauncher):
     """One process per job; `conf/hydra/launcher/processes.yaml` explains the parameters."""
 
-    def __init__(self, workers: int | None, threads: int, time_limit: float | None, sweep: str | None) -> None:
-        super().__init__(sweep)
-        self.workers, self.threads, self.time_limit = workers, threads, time_limit
+    workers: int | None = None
+    threads: int = 1
+    time_limit: float | None = None
+    sweep: str | None = None
 
     def pool(self, run: SweepRun, lease: Lease) -> ProcessPool:
         """Its server starts at once, while the sweep is opened."""

@@ -112,14 +112,15 @@ class RayPool(Pool[RayTask]):
             self._ray.cancel(ref, force=True)
 
 
+@dataclass(eq=False)
 class RayLauncher(SweepLauncher):
     """One Ray task per job; `conf/hydra/launcher/ray.yaml` explains the parameters."""
 
-    def __init__(
-        self, address: str | None, workers: int | None, threads: int, time_limit: float | None, sweep: str | None
-    ) -> None:
-        super().__init__(sweep)
-        self.address, self.workers, self.threads, self.time_limit = address, workers, threads, time_limit
+    address: str | None = None
+    workers: int | None = None
+    threads: int = 1
+    time_limit: float | None = None
+    sweep: str | None = None
 
     def pool(self, run: SweepRun, lease: Lease) -> RayPool:
         """On the cluster at the address, or a new one."""

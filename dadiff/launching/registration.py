@@ -2,50 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, fields, make_dataclass
+from typing import get_type_hints
 
 PLUGINS = ("hydra_plugins.", "hydra._internal.core_plugins.", "dadiff.launching.")
-
-
-@dataclass
-class ProcessesSchema:
-    """The typed schema under `conf/hydra/launcher/processes.yaml`; the fields are explained there."""
-
-    _target_: str = "dadiff.launching.processes.ProcessesLauncher"
-    workers: int | None = None
-    threads: int = 1
-    time_limit: float | None = None
-    sweep: str | None = None
-
-
-@dataclass
-class SlurmSchema:
-    """The typed schema under `conf/hydra/launcher/slurm.yaml`."""
-
-    _target_: str = "dadiff.launching.slurm.SlurmLauncher"
-    cluster: str = "slurm"
-    workers: int = 16
-    threads: int = 1
-    time_limit: float = 14400.0
-    memory: float | None = None
-    gpus: int | None = None
-    partition: str | None = None
-    account: str | None = None
-    options: dict[str, Any] = field(default_factory=dict)
-    sweep: str | None = None
-
-
-@dataclass
-class RaySchema:
-    """The typed schema under `conf/hydra/launcher/ray.yaml`."""
-
-    _target_: str = "dadiff.launching.ray.RayLauncher"
-    address: str | None = None
-    workers: int | None = None
-    threads: int = 1
-    time_limit: float | None = None
-    sweep: str | None = None
 
 
 @dataclass
@@ -75,17 +35,23 @@ def register() -> None:
     from dadiff.launching.sweeper import RunSweeper
 
     Plugins.is_in_toplevel_plugins_module = staticmethod(_is_plugin)  # type: ignore[assignment]
-    launchers: dict[str, tuple[type[Plugin], type]] = {
-        "processes": (ProcessesLauncher, ProcessesSchema),
-        "slurm": (SlurmLauncher, SlurmSchema),
-        "ray": (RayLauncher, RaySchema),
-    }
-    for name, (launcher, schema) in launchers.items():
+    launchers: dict[str, type[Plugin]] = {"processes": ProcessesLauncher, "slurm": SlurmLauncher, "ray": RayLauncher}
+    for name, launcher in launchers.items():
         plugins.register(launcher)
-        ConfigStore.instance().store(group="hydra/launcher", name=f"{name}_schema", node=schema)
+        ConfigStore.instance().store(group="hydra/launcher", name=f"{name}_schema", node=_schema(launcher))
     plugins.register(RunSweeper)
     ConfigStore.instance().store(group="hydra/sweeper", name="cells", node=CellsSchema)
     install()
+
+
+def _schema(launcher: type) -> type:
+    """The typed schema under the yaml of a launcher: its fields, which are explained there, and which class it is."""
+    types, target = get_type_hints(launcher), f"{launcher.__module__}.{launcher.__qualname__}"
+    parts = [
+        (part.name, types[part.name], field(default=part.default, default_factory=part.default_factory))
+        for part in fields(launcher)
+    ]
+    return make_dataclass(launcher.__name__, [("_target_", str, target), *parts])
 
 
 def _is_plugin(name: str) -> bool:

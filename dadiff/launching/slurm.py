@@ -6,7 +6,7 @@ import math
 import shutil
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -113,34 +113,30 @@ class SlurmPool(Pool[SlurmJob]):
             time.sleep(POLL_SECONDS)
 
 
+@dataclass(eq=False)
 class SlurmLauncher(SweepLauncher):
     """One Slurm job per job; the parameters are explained in `conf/hydra/launcher/slurm.yaml`."""
 
-    def __init__(
-        self,
-        cluster: str,
-        workers: int,
-        threads: int,
-        time_limit: float,
-        memory: float | None,
-        gpus: int | None,
-        partition: str | None,
-        account: str | None,
-        options: Mapping[str, Any],
-        sweep: str | None,
-    ) -> None:
-        super().__init__(sweep)
-        self.cluster, self.workers, self.threads, self.time_limit = cluster, workers, threads, time_limit
-        self.asked = {
-            "name": "dadiff",
-            "mem_gb": memory,
-            "gpus_per_node": gpus,
-            "slurm_partition": partition,
-            "slurm_account": account,
-            "slurm_additional_parameters": dict(options),
-        }
+    cluster: str = "slurm"
+    workers: int = 16
+    threads: int = 1
+    time_limit: float = 14400.0
+    memory: float | None = None
+    gpus: int | None = None
+    partition: str | None = None
+    account: str | None = None
+    options: dict[str, Any] = field(default_factory=dict)
+    sweep: str | None = None
 
     def pool(self, run: SweepRun, lease: Lease) -> SlurmPool:
         """With submitit's files beside the sweep's logs."""
+        asked = {
+            "name": "dadiff",
+            "mem_gb": self.memory,
+            "gpus_per_node": self.gpus,
+            "slurm_partition": self.partition,
+            "slurm_account": self.account,
+            "slurm_additional_parameters": dict(self.options),
+        }
         folder = run.folder / "submitit"
-        return SlurmPool(folder, self.cluster, self.workers, self.threads, self.time_limit, self.asked, lease)
+        return SlurmPool(folder, self.cluster, self.workers, self.threads, self.time_limit, asked, lease)
