@@ -605,6 +605,33 @@ def test_with_more_data_it_becomes_the_hard_projection():
     assert deviations[0] > 3 * deviations[1] > 3 * deviations[2]
 
 
+def test_where_nothing_is_known_but_x_init_what_is_correlated_with_it_moves_along(rng):
+    """As a Gaussian is conditioned on some of its entries; in the identity metric nothing else moves."""
+    layout = double_integrator().layout(3)
+    d, held = layout.size, np.arange(4)
+    where = Coordinates(rng.standard_normal(d), rng.uniform(0.5, 2, d))
+    metric = Covariance(rng.uniform(0.1, 1, d), rng.standard_normal((d, 3)))
+    z, x_init = rng.standard_normal((5, d)), rng.standard_normal((5, 4))
+    P = Inpainting().fit(layout).bind(where, [Pin.initial_state(layout, x_init)])
+    asked = (x_init - where.mean[held]) / where.scale[held] - z[:, held]
+    C = metric.matrix
+    moved = asked @ np.linalg.solve(C[np.ix_(held, held)], C[held])
+    np.testing.assert_allclose(P(z, metric), z + moved, atol=1e-10)
+    np.testing.assert_allclose(P(z), z + np.pad(asked, ((0, 0), (0, d - 4))), atol=1e-12)
+
+
+@pytest.mark.parametrize("dense_up_to", [600, 10], ids=["dense", "blocks"])
+def test_the_size_of_a_metric_does_not_matter(monkeypatch, dense_up_to, rng):
+    monkeypatch.setattr("dadiff.behaviours.sets.DENSE_UP_TO", dense_up_to)
+    system = double_integrator()
+    layout = system.layout(3)
+    P = Known("fixed").fit(layout, system).bind(pins=[Pin.initial_state(layout, rng.standard_normal((5, 4)))])
+    z, variances = rng.standard_normal((5, layout.size)), rng.uniform(0.1, 1, layout.size)
+    factor = rng.standard_normal((layout.size, 2))
+    tiny = Covariance(1e-20 * variances, 1e-10 * factor)
+    np.testing.assert_allclose(P(z, tiny), P(z, Covariance(variances, factor)), atol=1e-9)
+
+
 # --- input-output data: the state is not measured, and a pinned past stands for it
 
 

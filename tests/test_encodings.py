@@ -100,6 +100,17 @@ def test_depth_is_how_far_the_path_enters_inflated_discs(cases: Cases) -> None:
     np.testing.assert_allclose(encoder.layout.get(features, "depth")[..., 0], depth.sum(axis=2), atol=1e-12)
 
 
+def test_one_disc_is_seen_in_the_direction_from_its_centre_to_the_path(cases: Cases) -> None:
+    encoder = ENCODERS["path_frame"]
+    disc = np.array([0.3, -0.2, 0.5, 1.0])
+    features, reference = encoder.encode(
+        with_obstacles(cases, lambda slots: np.where(np.arange(slots.shape[1])[:, None] == 0, disc, 0 * slots))
+    )
+    near, normal = (encoder.layout.get(features, name) for name in ("near", "near_normal"))
+    away = LAYOUT.states(reference)[:, 2:, :2] - disc[:2]
+    np.testing.assert_allclose(normal, near * away / np.linalg.norm(away, axis=-1, keepdims=True), atol=1e-12)
+
+
 def test_what_path_frame_cannot_do_is_said() -> None:
     with pytest.raises(ConfigError, match="task LQR has no obstacle-free optimum; use task=obstacles"):
         PathFrame().encoder(LQR(), double_integrator())

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from dadiff.behaviours import IdentifiedFamily, Transitions, compared, least_squares
-from dadiff.behaviours.family import Belief, Moments, posterior, prior
+from dadiff.behaviours.family import Belief, Channels, Moments, posterior, prior
 from dadiff.behaviours.sets import Dynamics
-from dadiff.behaviours.stages import stages_of
+from dadiff.behaviours.stages import Stages, stages_of
 from dadiff.errors import ConfigError
 from dadiff.systems import DampedIntegrators, GaussianExcitation, Recording
 from dadiff.tasks import Fleet
@@ -38,6 +38,32 @@ def parameters(robots) -> np.ndarray:
 
 def recording(length: int, noise: float = 0.05, seed: int = 0) -> Recording:
     return GaussianExcitation(length=length, process_noise=noise, seed=seed).record(ROBOTS)
+
+
+@pytest.mark.parametrize("centred", [True, False])
+def test_channels_are_of_size_1_about_their_mean_or_about_0(centred):
+    tau = shown() + 3.0
+    channels = Channels.of(LAYOUT, tau, centred=centred)
+    for values, centre in zip(
+        LAYOUT.split(channels.scaled_trajectories(LAYOUT, tau)), (channels.centre_x, channels.centre_u), strict=True
+    ):
+        np.testing.assert_allclose(np.square(values).mean(axis=(0, 1)), 1, rtol=1e-12)
+        if centred:
+            np.testing.assert_allclose(values.mean(axis=(0, 1)), 0, atol=1e-12)
+        else:
+            np.testing.assert_array_equal(centre, 0)
+
+
+def test_dynamics_in_channels_are_the_same_in_physical_units(rng):
+    n, m = LAYOUT.state_dim, LAYOUT.input_dim
+    channels = Channels.of(LAYOUT, shown() + 3.0, centred=True)
+    within = Stages.constant(*(rng.standard_normal((n, k)) for k in (n, m)), rng.standard_normal(n), LAYOUT.horizon)
+    c, x, u = rng.standard_normal(n), rng.standard_normal((5, n)), rng.standard_normal((5, m))
+    following = x @ within.A[0].T + u @ within.B[0].T + within.c[0]
+    found = channels.physical(within, c)
+    x, u = x * channels.size_x + channels.centre_x, u * channels.size_u + channels.centre_u
+    expected = following * channels.size_x + channels.centre_x + c
+    np.testing.assert_allclose(x @ found.A[0].T + u @ found.B[0].T + found.c[0], expected, atol=1e-10)
 
 
 def test_the_family_is_found_in_its_demonstrations():
@@ -92,6 +118,8 @@ def test_a_fleet_is_its_robots_one_by_one_and_the_set_is_near_the_truth():
     np.testing.assert_allclose(
         together.spread[2] @ together.spread[2].T, one.spread @ one.spread.T, atol=1e-9 * np.square(one.spread).max()
     )
+    variances = np.einsum("rik,rik->ri", together.spread, together.spread)
+    assert together.notes["residual_deviation"] == pytest.approx(np.sqrt(variances.mean()))
     truth = Dynamics(LAYOUT, stages_of(ROBOTS, 12))
     data = Transitions.of(rec.states, rec.inputs)
     alone = Dynamics(LAYOUT, least_squares(data).stages(12))

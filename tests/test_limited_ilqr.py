@@ -33,6 +33,15 @@ def problem(robot: PlanarQuadrotor, rng: np.random.Generator, plans: int = 3) ->
     return LimitedTracking.by_bounds(robot, metric, rng.standard_normal((plans, layout.size)), x_init)
 
 
+def test_the_cost_is_that_of_the_metric(rng):
+    robot = PlanarQuadrotor(bounds=INPUTS)
+    layout = robot.layout(HORIZON)
+    metric = Metric.diagonal(layout, rng.uniform(0.2, 2, layout.size))
+    reference, tau = rng.standard_normal((2, 3, layout.size))
+    given = LimitedTracking.by_bounds(robot, metric, reference, tau[:, :6])
+    np.testing.assert_allclose(given.cost(tau), metric.squared(tau - reference), rtol=1e-12)
+
+
 @pytest.mark.parametrize("bounds", [INPUTS, STATES], ids=["inputs", "inputs and states"])
 def test_ipopt_finds_the_same_cost(bounds, rng):
     pytest.importorskip("casadi")

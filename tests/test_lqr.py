@@ -16,7 +16,7 @@ from dadiff.evaluation import replay
 from dadiff.evaluation.errors import dynamics_residual
 from dadiff.experts.lqr import ClosedLoopLaw, follow, optimal_feedback, stationary_feedback
 from dadiff.randomness import numpy_generator
-from dadiff.systems import AffineSystem, Bounds, DampedIntegrators, Linear, double_integrator
+from dadiff.systems import AffineSystem, Bounds, DampedIntegrators, Linear, TimeVarying, double_integrator
 from dadiff.tasks import LQR, Fleet
 from dadiff.tasks.obstacles import Obstacles
 
@@ -116,6 +116,14 @@ def test_the_stationary_expert_steers_by_the_deviation_from_the_target(system):
     assert feedback.horizon == 5
     assert np.array_equal(feedback.L, -feedback.K)
     assert (feedback.K[0] == feedback.K).all()
+
+
+def test_the_stationary_expert_is_refused_where_something_varies_or_is_added():
+    A, B = np.eye(2), np.ones((2, 1))
+    varying = TimeVarying(np.stack([A] * 5), np.stack([B] * 5), np.zeros((5, 2)))
+    for system in (varying, Linear(A, B, np.ones(2))):
+        with pytest.raises(ConfigError, match="expert=stationary is for systems that do not vary"):
+            stationary_feedback(system, np.eye(2), np.eye(1), 5)
 
 
 @pytest.mark.parametrize("solve", [optimal_feedback, stationary_feedback])

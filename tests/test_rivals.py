@@ -173,7 +173,7 @@ def test_gradients_need_a_denoiser_that_has_them(enforcement):
         enforcement.clean(TAU0, context(lambda tau, i, E: tau))
 
 
-@pytest.mark.parametrize("make", [lambda: DPS(-1.0), lambda: PPR(0), lambda: ProjectedSamples(2.0)])
+@pytest.mark.parametrize("make", [lambda: DPS(-1.0), lambda: PPR(0), lambda: ProjectedSamples(1.01)])
 def test_parameters_without_meaning_are_refused(make):
     with pytest.raises(ConfigError, match="it must lie in"):
         make()

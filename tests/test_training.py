@@ -5,7 +5,9 @@ from __future__ import annotations
 import csv
 import signal
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -104,6 +106,14 @@ def test_a_killed_training_resumes_from_its_last_checkpoint(loss_weight, tmp_pat
     assert same_weights(tmp_path / "whole", tmp_path / "parts")
     losses = [[row["loss"] for row in read_curve(tmp_path / name)] for name in ("whole", "parts")]
     assert losses[0] == losses[1]
+
+
+def test_the_clock_of_a_resumed_training_goes_on_where_it_stopped(monkeypatch, tmp_path):
+    monkeypatch.setattr("dadiff.denoisers.learning.time", SimpleNamespace(perf_counter=count().__next__))
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, augment=Interrupt(5))
+    run(tmp_path)
+    assert [float(row["seconds"]) for row in read_curve(tmp_path)] == list(range(1, SHORT.steps + 1))
 
 
 def test_augmentation_resumes_too(tmp_path):
