@@ -45,5 +45,9 @@ class LockedError(StoreError):
     """Another process is working on the same thing."""
 
 
+class WorkerError(DadiffError):
+    """The processes that do the work cannot be started."""
+
+
 class MissingExtraError(DadiffError):
     """An optional package is not installed."""

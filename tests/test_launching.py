@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from dadiff.errors import ConfigError, DataError
+from dadiff.errors import ConfigError, DataError, WorkerError
 from dadiff.launching.outcome import Outcome, why
 from dadiff.launching.process_pool import ProcessPool
 from dadiff.launching.table import Table, clock, last_line, progress_of, shortened, time_left
@@ -269,3 +269,11 @@ def test_work_that_is_alone_waits_for_the_rest_and_has_every_thread(tmp_path):
     begun, ended = ({key: float(words[k]) for key, words in seen.items()} for k in (1, 2))
     assert max(ended["a"], ended["b"]) <= begun["c"]
     assert ended["c"] <= min(begun["d"], begun["e"])
+
+
+def test_a_server_that_was_killed_is_told_in_a_line(tmp_path, monkeypatch):
+    pool = ProcessPool(1)
+    for error in (EOFError("unexpected EOF"), ConnectionRefusedError(111, "Connection refused"), BrokenPipeError()):
+        monkeypatch.setattr(pool._context.Process, "start", lambda self, error=error: (_ for _ in ()).throw(error))
+        with pytest.raises(WorkerError, match=r"^launcher: the server that jobs are forked from has died .*goes on"):
+            pool.run([], Silent())

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerProcess
 
+from dadiff.errors import WorkerError
 from dadiff.launching.outcome import Outcome
 from dadiff.launching.pool import GRACE_SECONDS, TICK_SECONDS, Pool, check_positive
 from dadiff.launching.work import Observer, Running, Work, environment, perform
@@ -62,7 +63,7 @@ class ProcessPool(Pool[Process]):
     def run(self, works: Sequence[Work], observer: Observer) -> dict[str, Outcome]:
         """Run everything once the server has imported everything, so that no job's time limit counts that."""
         probe = self._context.Process(target=int)
-        probe.start()
+        _fork(probe)
         probe.join()
         return super().run(works, observer)
 
@@ -74,7 +75,7 @@ class ProcessPool(Pool[Process]):
         receive, send = self._context.Pipe(duplex=False)
         threads = min(self.threads * self.workers, cores()) if work.alone else self.threads
         process = self._context.Process(target=_main, args=(work, threads, send), name=work.name)
-        process.start()
+        _fork(process)
         send.close()
         return Process(work, process, receive)
 
@@ -104,6 +105,21 @@ def _start_server(threads: int) -> None:
 
     with environment({**limits(threads), **SERVER}), _deaf():
         forkserver.ensure_running()
+
+
+def _fork(process: ForkServerProcess) -> None:
+    """Start a process.
+
+    Raises:
+        WorkerError: if the server that it is forked from has died.
+    """
+    try:
+        process.start()
+    except (EOFError, ConnectionError) as error:
+        raise WorkerError(
+            f"launcher: the server that jobs are forked from has died ({str(error) or type(error).__name__}): was it "
+            "killed, or memory short? the same command goes on from what is stored"
+        ) from error
 
 
 @contextmanager
