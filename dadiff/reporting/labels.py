@@ -15,6 +15,8 @@ PROJECTORS = {
     "hankel_lowrank": "Hankel, truncated",
     "identified": "identified (A, B)",
     "identified_soft": "identified, trusted by direction",
+    "identified_sparse": "identified, few terms",
+    "identified_sparse_soft": "few terms, trusted by their errors",
     "identified_family": "identified within its family",
     "known_bounded": "known, within bounds",
     "known_tightened": "known, within tightened bounds",
