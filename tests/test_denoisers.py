@@ -10,7 +10,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from dadiff.denoisers import MLP, EncoderDecoder, Gaussian
+from dadiff.denoisers import MLP, EncoderDecoder, Gaussian, InputsMLP
 from dadiff.denoisers.checkpoints import load, save, write
 from dadiff.denoisers.exact import ExactDenoiser, Smoother
 from dadiff.denoisers.learned import CHUNK, NetworkDenoiser
@@ -83,6 +83,15 @@ def test_posterior_mean_weights_are_the_error_of_the_reverse_mean(schedule):
     np.testing.assert_allclose(by_velocity[i] / by_velocity[1], factor**2 * (1 - a) / (factor[0] ** 2 * (1 - a[0])))
     assert by_clean[1:].mean() == pytest.approx(1)
     assert (loss_weights("uniform", schedule, clean) == 1).all()
+
+
+@pytest.mark.parametrize("recipe", [MLP, InputsMLP])
+def test_what_a_network_is_said_to_take_is_near_what_its_weights_take(monkeypatch, recipe):
+    """Four bytes each for a weight, its gradient, Adam's two moments and the running mean."""
+    said: list[float] = []
+    monkeypatch.setattr("dadiff.denoisers.recipes.check_fits", lambda size, what: said.append(size))
+    weights = sum(w.numel() for w in build(recipe(width=256, blocks=3)).network.parameters())
+    assert said[0] == pytest.approx(5 * 4 * weights, rel=0.25)
 
 
 # --- the exact posterior mean

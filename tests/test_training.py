@@ -306,6 +306,11 @@ def test_the_loss_is_that_of_the_forward_process():
     assert float(found) == pytest.approx(np.square(seen / 2 - tau0).mean(), rel=1e-5)
 
 
+def test_the_running_mean_forgets_the_first_weights_soon():
+    decays = [Training(ema_decay=0.9).ema_decay_at(step) for step in (0, 5, 10, 1000)]
+    assert decays == pytest.approx([1 / 10, 6 / 15, 11 / 20, 0.9])
+
+
 def test_a_training_may_begin_at_full_rate():
     assert Training(warmup=0).warmup == 0
 
