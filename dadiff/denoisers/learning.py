@@ -207,7 +207,7 @@ class State:
     running_mean: list[Tensor] = field(init=False)
 
     def __post_init__(self) -> None:
-        self.weights = list(self.denoiser.parameters())
+        self.weights: list[Tensor] = list(self.denoiser.parameters())
         self.adam = {name: [torch.zeros_like(w) for w in self.weights] for name in ("exp_avg", "exp_avg_sq")}
         self.adam["step"] = [torch.zeros((), device=w.device) for w in self.weights]
         self.running_mean = [w.detach().clone() for w in self.weights]
@@ -229,12 +229,12 @@ class State:
     def _descend(self) -> None:
         """A step of Adam (Kingma & Ba 2015), as `torch.optim.Adam(fused=True)`, which takes a second to be made."""
         m, v, steps = self.adam["exp_avg"], self.adam["exp_avg_sq"], self.adam["step"]
+        gradients = [w.grad for w in self.weights if w.grad is not None]
         torch._foreach_add_(steps, 1)
         torch._fused_adam_(
-            *(self.weights, [w.grad for w in self.weights], m, v, [], steps),
-            **{"lr": self.training.learning_rate_at(self.step), "beta1": 0.9, "beta2": 0.999, "eps": 1e-8},
-            **{"weight_decay": 0.0, "amsgrad": False, "maximize": False},
-        )
+            self.weights, gradients, m, v, [], steps, lr=self.training.learning_rate_at(self.step),
+            beta1=0.9, beta2=0.999, eps=1e-8, weight_decay=0.0, amsgrad=False, maximize=False,
+        )  # fmt: skip
         for w in self.weights:
             w.grad = None
 
