@@ -632,6 +632,13 @@ def test_the_size_of_a_metric_does_not_matter(monkeypatch, dense_up_to, rng):
     np.testing.assert_allclose(P(z, tiny), P(z, Covariance(variances, factor)), atol=1e-9)
 
 
+def test_pins_take_their_number_from_the_rank_of_the_subspaces_of_many_robots(rng):
+    layout = double_integrator().layout(3)
+    span = Span(layout, rng.standard_normal((3, layout.size, 10)))
+    pin = Pin.initial_state(layout, rng.standard_normal((3, 1, 4)))
+    assert (span.bind().info.rank, span.bind(pins=[pin]).info.rank) == (10, 6)
+
+
 # --- input-output data: the state is not measured, and a pinned past stands for it
 
 

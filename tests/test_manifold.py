@@ -46,6 +46,7 @@ def test_plans_are_feasible_after_one_sweep(weighted, rng):
     np.testing.assert_allclose(states[..., 0, :], x_init, atol=1e-12)
     np.testing.assert_allclose(ROBOTS.simulate(x_init, inputs), states, atol=1e-12)
     assert (project.info.kind, project.info.iterations, project.info.unconverged) == ("manifold", 1, 0)
+    assert project.info.rank == LAYOUT.rank - 6
 
 
 def test_projecting_again_changes_nothing(rng):

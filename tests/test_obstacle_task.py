@@ -41,6 +41,7 @@ def test_drawn_environments_leave_room_and_lie_in_range(distribution: str) -> No
     assert np.abs(e.x_init).max() <= 1
     assert np.abs(e.target).max() <= 4
     assert ((e.radius >= 0.4) & (e.radius <= 0.8))[e.present].all()
+    assert np.ptp(e.radius[e.present]) > 0.35
     assert (e.radius[~e.present] == 0).all()
     points = np.stack([e.x_init[:, :2], e.x_init[:, :2] + 0.1 * e.x_init[:, 2:], e.target, *e.waypoint.swapaxes(0, 1)])
     gap = np.linalg.norm(points[:, :, None] - e.centre, axis=-1) - e.radius
