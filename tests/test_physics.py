@@ -146,6 +146,15 @@ def test_with_an_offset_estimated_such_data_are_as_good_as_any(harm, tmp_path, c
     assert "the robot has an offset that the configured system has not, c = [" in caplog.text
 
 
+def test_where_no_noise_is_configured_what_the_residual_would_be_is_said(tmp_path):
+    np.savez(tmp_path / "a.npz", states=X, inputs=U)
+    told = (
+        r"as system\.process_noise is 0 \(if the residual is noise, set it to \[0\.0\d+, 0\.0\d+, 0\.0\d+, 0\.0\d+\]\)"
+    )
+    with pytest.raises(DataError, match=told):
+        NpzRecordings(str(tmp_path)).record(double_integrator(process_noise=0.0))
+
+
 def test_good_data_have_a_residual_of_one_and_cost_no_word(tmp_path, caplog):
     np.savez(tmp_path / "a.npz", states=X, inputs=U)
     with caplog.at_level(logging.WARNING):

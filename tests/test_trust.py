@@ -122,6 +122,10 @@ def test_hydra_is_asked_to_do_nothing_but_compose(override):
         ("dry_run", "is no override; write group=choice or group.key=value"),
         ("sampler=[", "cannot be read as key=value"),
         ("seed=${nowhere}", "nowhere"),
+        (
+            "task={hrizon:1}",
+            "task does not take this value; choose a preset, task=name, or set parameters, task.name=value",
+        ),
         ("seed=1,2", "seed=1,2 may be a sweep or a list; write -m to sweep over it, or 'seed=[1,2]'"),
         ("training.steps=1,2", "training.steps=1,2 may be a sweep or a list"),
         ("+sweeps=lqr_quick training.steps=1,2 projectr=known", "key 'projectr' is not known; did you mean projector?"),

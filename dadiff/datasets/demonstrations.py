@@ -186,7 +186,7 @@ class NpzTrajectories:
 
     def determined_by(self, part: Part) -> dict[str, Any]:
         """What the folder holds, in place of where it lies, and what is taken of it."""
-        list_logs(folder := Path(self.path) / part)
+        _files(folder := Path(self.path) / part)
         taken = {"columns": self.columns, "stride": self.stride if self.stride > 1 else None}
         size = self.train_size if part == "train" else self.test_size
         return {"content": content_of(folder), "size": size} | {k: v for k, v in taken.items() if v}
@@ -223,12 +223,20 @@ class NpzTrajectories:
         stride = self.stride if part == "train" else task.horizon
         runs = (
             run
-            for file in list_logs(folder)
+            for file in _files(folder)
             for arrays in arrays_of(file, self.columns, (TARGET, START))
             for run in Shown.all_in(arrays, str(file), system)
         )
         with saying():
             return Windows.of(list(islice(runs, count)), task.horizon, stride, str(folder))
+
+
+def _files(folder: Path) -> list[Path]:
+    if not folder.is_dir():
+        raise DataError(
+            f"{folder}: there is no such folder; demonstrations lie in train and test cases in test, below dataset.path"
+        )
+    return list_logs(folder)
 
 
 def demonstrations_of(

@@ -66,7 +66,7 @@ def list_logs(folder: Path) -> list[Path]:
     files = sorted(file for file in folder.iterdir() if file.suffix in ENDINGS)
     files = files or sorted(file for file in (folder / "data").rglob("*") if file.suffix in ENDINGS)
     if not files:
-        raise DataError(f"{folder}: holds no file that ends in {', '.join(ENDINGS)}; expected one for each recording")
+        raise DataError(f"{folder}: holds no file that ends in {', '.join(ENDINGS)}; expected at least one")
     return files
 
 
@@ -147,7 +147,7 @@ def _plain(where: str, arrays: Arrays, names: Sequence[str], size: int) -> np.nd
     if values.ndim not in (2, 3) or values.shape[-1] != size:
         turned = values.ndim == 2 and values.shape[0] == size
         what = "states" if names == STATES else "inputs"
-        remedy = "; transpose it?" if turned else f"; the system has {size} {what}: choose columns, or another system"
+        remedy = "; transpose it?" if turned else f"; the system has {size} {what}: choose which, or another system"
         raise DataError(f"{where}: array {name} has shape {values.shape}; expected (any, {size}){remedy}")
     return _finite(where, name, values)
 
@@ -248,7 +248,7 @@ def _time_stamps(where: str, arrays: Arrays, rows: Sequence[int], time_step: flo
         if time_step is not None and abs(usual - time_step) > 0.01 * time_step:
             units = [f", in {name}?" for k, name in UNITS_OF_TIME.items() if 0.99 < usual / time_step / k < 1.01]
             found = f"its time step is {usual:.4g} s, the system's {time_step:.4g} s{units[0] if units else ''}"
-            raise DataError(f"{where}: {found}; sample it anew, or mend one")
+            raise DataError(f"{where}: {found}; set system.time_step to that of the data, or sample them anew")
     return stamps if stamps is not None and stamps.ndim == 1 else None
 
 

@@ -203,15 +203,23 @@ def judge(
     if found.ratio < plant.warned:
         return found.ratio
     k, t = found.worst
-    place = f"{names[k] if names else f'trajectory {k}'} at t = {t}"
+    place = f"in {names[k]} at" if names else f"in trajectory {k} at" if len(states) > 1 else "at"
     told = (
-        f"{where}: the data do not obey {plant.name}: x(t+1) - f(x(t), u(t)) is {found.ratio:.3g} times its process "
-        f"noise, most in {place}{'; ' + found.cause if found.cause else ''}"
+        f"{where}: the data do not obey {plant.name}: x(t+1) - f(x(t), u(t)) is {found.ratio:.3g} times "
+        f"{_held_against(plant, states, inputs)}, most {place} t = {t}{'; ' + found.cause if found.cause else ''}"
     )
     if found.ratio >= REFUSED and not allow_mismatch:
         raise DataError(f"{told}; mend the data or the system, or set allow_mismatch=true")
     log.warning("%s", told)
     return found.ratio
+
+
+def _held_against(plant: Plant, states: np.ndarray, inputs: np.ndarray) -> str:
+    """The process noise; where none is configured, what it would be if the residual were noise."""
+    if plant.learned or (plant.noise > 0).all():
+        return "its process noise"
+    found = ", ".join(f"{value:.2g}" for value in plant.residual(states, inputs).std(axis=(0, 1)))
+    return f"{STEP_SHARE:g} of a step, as system.process_noise is 0 (if the residual is noise, set it to [{found}])"
 
 
 def judge_runs(plant: Plant, runs: Sequence[Run], where: str, allow_mismatch: bool) -> float:

@@ -117,6 +117,10 @@ class GuardedLoader(ConfigLoaderImpl):
         if (found := text.partition("Could not override '")[2]) and config_name:
             key = found.partition("'")[0]
             usual = super().load_configuration(config_name, [], RunMode.RUN)
+            if key in usual:
+                return (
+                    f"{key} does not take this value; choose a preset, {key}=name, or set parameters, {key}.name=value"
+                )
             return f"key {key!r} is not known; {_meant(key, [*_keys(usual)])}"
         return text
 

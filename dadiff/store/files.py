@@ -36,7 +36,7 @@ def make_folder(path: Path) -> Path:
     except OSError as error:
         raise StoreError(f"{path}: cannot make this folder ({error.strerror}); choose another output_dir") from error
     if not os.access(path, os.W_OK):
-        raise StoreError(f"{path}: this folder cannot be written to; choose another output_dir")
+        raise StoreError(f"{path}: this folder cannot be written to; choose another output_dir (of a report: --out)")
     return path
 
 
