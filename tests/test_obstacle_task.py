@@ -289,6 +289,18 @@ def test_the_input_cost_that_the_message_names_is_the_smallest_that_does() -> No
         literal.check_bounded(replace(problem, input_cost=needed * (1 - 1e-6)), 0)
 
 
+@pytest.mark.parametrize("input_cost", [1.0, 30.0, 60.0])
+def test_the_number_of_obstacles_that_the_message_names_is_the_largest_that_does(input_cost: float) -> None:
+    problem = literal_problem(input_cost=input_cost)
+    present = int((problem.radius > 0).sum())
+    least = [np.linalg.eigvalsh(literal.curvature(problem, 0, k))[0] for k in range(present + 1)]
+    if least[present] >= 0:
+        return literal.check_bounded(problem, 0)
+    with pytest.raises(InfeasibleError) as told:
+        literal.check_bounded(problem, 0)
+    assert f"or at most {sum(value >= 0 for value in least) - 1} of its {present} obstacles" in str(told.value)
+
+
 def test_a_bounded_printed_cost_is_solved_to_its_minimum() -> None:
     problem = literal_problem(waypoint_weight=1000.0, input_cost=1.0)
     found = literal.solve(problem)
