@@ -13,7 +13,8 @@ import numpy as np
 from scipy.stats import beta, binom, rankdata
 
 from dadiff.reporting.aggregation import Method, has_metric
-from dadiff.reporting.statistics import UNITS, Estimate
+from dadiff.reporting.labels import FLOORS
+from dadiff.reporting.statistics import UNITS, Estimate, mean
 
 TAIL = 0.025
 
@@ -64,9 +65,14 @@ def at_their_best(methods: list[Method], metric: str, tuned: Sequence[str]) -> l
     kept = []
     for alike in groups.values():
         judged = [method for method in alike if method.finished and has_metric(method.finished, metric)]
-        best = min(judged, key=lambda method: float(method.runs.scalars(metric).values.mean()), default=None)
+        best = min(judged, key=lambda method: _average(method, metric), default=None)
         kept += [method for method in alike if method is best or method not in judged]
     return kept
+
+
+def _average(method: Method, metric: str) -> float:
+    """The mean that tables show."""
+    return mean(method.runs.scalars(metric), FLOORS.get(metric, 0)).value
 
 
 def _by_case(method: Method, metric: str) -> np.ndarray | None:
