@@ -54,6 +54,8 @@ def check_what_is_printed(arguments: list[str]) -> None:
     if given.experimental_rerun is not None:
         raise ConfigError("--experimental-rerun: is not offered, as it would load a pickle; give the overrides")
     if given.cfg is None:
+        if given.resolve:
+            raise ConfigError("--resolve: says how --cfg prints a configuration; give it with --cfg job")
         return
     from dadiff.config import assemble
 

@@ -10,6 +10,7 @@ import yaml
 from hydra import compose, initialize_config_dir
 from laws import CONF, composed, node, presets
 
+from dadiff.cli import check_what_is_printed
 from dadiff.config import GROUPS, assemble
 from dadiff.config.build import resolve
 from dadiff.config.protocols import PROTOCOLS
@@ -158,3 +159,9 @@ def test_variables_of_the_trusting_process_reach_its_jobs(monkeypatch):
     monkeypatch.setenv(VARIABLE, "a, b,,a")
     trust(["c"])
     assert os.environ[VARIABLE] == "a,b,c"
+
+
+@pytest.mark.parametrize("given", [["--resolve"], ["--experimental-rerun", "x"]])
+def test_options_that_mean_nothing_here_are_told_in_a_line(given):
+    with pytest.raises(ConfigError, match=rf"^{given[0]}: "):
+        check_what_is_printed(given)
