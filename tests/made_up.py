@@ -121,7 +121,8 @@ class Draw:
     def per_plan(self, levels: dict[str, float]) -> pd.DataFrame:
         """The table with one row a plan."""
         columns = {name: level * self.factor[..., 0] for name, level in levels.items()}
-        columns["cost_ratio"] = 1 + (levels["cost_ratio"] - 1) * self.factor[..., 0]
+        for name in (name for name in levels if name.endswith("cost_ratio")):
+            columns[name] = 1 + (levels[name] - 1) * self.factor[..., 0]
         return self._table(columns, ("robot", "case", "sample"))
 
 

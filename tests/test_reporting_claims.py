@@ -11,6 +11,7 @@ import pytest
 from made_up import MadeUp, chain_table, example_arrays
 
 from dadiff.errors import ConfigError
+from dadiff.folders import shipped
 from dadiff.reporting.aggregation import Evidence
 from dadiff.reporting.claims import Claim, Finding, Verdict, decide, judge, read_ledger, sentence
 from dadiff.reporting.definitions import FOLDER, load, names
@@ -20,6 +21,7 @@ from dadiff.reporting.statistics import Estimate
 from dadiff.reporting.story import sentences
 
 LEDGER = {claim.id: claim for claim in read_ledger(FOLDER / "claims.yaml")}
+CONF = Path(str(shipped("conf")))
 TRUTHS = ("holds", "does not hold", "undecided")
 
 
@@ -65,10 +67,10 @@ def level_store(folder: Path, claim: Claim, truth: str) -> MadeUp:
     bound = target(claim.rule, truth)
     metric = claim.options["metric"]
     far = {"holds": 0.1}.get(truth, 1) if len(claim.rule) == 1 else 0.9
-    value = 1 + (bound - 1) * far if metric == "cost_ratio" else bound * far
+    value = 1 + (bound - 1) * far if metric.endswith("cost_ratio") else bound * far
     for seed in range(3):
         off = {"undecided": (0.3, 1.0, 1.7)[seed]}.get(truth, 1)
-        scaled = 1 + (value - 1) * off if metric == "cost_ratio" else value * off
+        scaled = 1 + (value - 1) * off if metric.endswith("cost_ratio") else value * off
         store.run(levels={metric: scaled}, per_plan={metric: scaled}, seed=seed, spread=0.1, **concrete(claim.cells))
     return store
 
@@ -77,8 +79,11 @@ def ratio_store(folder: Path, claim: Claim, truth: str) -> MadeUp:
     store, axes = MadeUp(folder), concrete(claim.cells)
     for seed in range(3):
         off = {"undecided": (0.6, 1.0, 1.4)[seed]}.get(truth, 1)
-        store.run(1.0, seed=seed, **baseline_axes(claim, axes))
-        store.run(target(claim.rule, truth) * off, seed=seed, **axes)
+        value, exact = target(claim.rule, truth) * off, claim.options.get("exact", False)
+        store.run(
+            1.0, seed=seed, metrics={claim.options["metric"]: 1.0} if exact else None, **baseline_axes(claim, axes)
+        )
+        store.run(value, seed=seed, metrics={claim.options["metric"]: value} if exact else None, **axes)
     return store
 
 
@@ -149,7 +154,7 @@ EXACT = ("steps_grew", "schedule_conditions")
 @pytest.mark.parametrize("truth", TRUTHS)
 @pytest.mark.parametrize("claim", LEDGER.values(), ids=LEDGER)
 def test_verdicts(claim, truth, tmp_path):
-    if truth == "undecided" and claim.statistic in EXACT:
+    if truth == "undecided" and (claim.statistic in EXACT or claim.options.get("exact")):
         pytest.skip("counted exactly, so it is never undecided")
     verdict = judged(STORES[claim.statistic](tmp_path, claim, truth), claim)
     assert verdict.word == truth, verdict.lines
@@ -342,9 +347,23 @@ def test_the_ledger_names_what_is_wrong(tmp_path):
             read_ledger(path)
 
 
-def test_reports_ask_for_claims_that_exist():
-    for name in names():
-        assert set(load(name).claims or []) <= set(LEDGER)
+def test_reports_ask_for_claims_that_exist_and_every_claim_is_asked_for():
+    asked = {claim for name in names() for claim in load(name).claims or []}
+    assert asked == set(LEDGER)
+
+
+def chosen(selector: dict[str, Any]) -> list[tuple[str, str]]:
+    """The components that a selector names, by group."""
+    plain = {axis: wanted.get("not", []) if isinstance(wanted, dict) else wanted for axis, wanted in selector.items()}
+    lists = {axis: wanted if isinstance(wanted, list) else [wanted] for axis, wanted in plain.items()}
+    return [(axis, name) for axis, wanted in lists.items() if (CONF / axis).is_dir() for name in wanted if name]
+
+
+@pytest.mark.parametrize("claim", LEDGER.values(), ids=LEDGER)
+def test_a_claim_names_components_as_runs_do(claim):
+    for group, name in chosen(claim.cells) + chosen(claim.options.get("against", {})):
+        preset = CONF / group / f"{name}.yaml"
+        assert name == "none" or "_target_:" in preset.read_text(), f"{preset} varies another component"
 
 
 def test_a_table_without_a_baseline_says_who_has_least_and_who_has_most():

@@ -28,8 +28,8 @@ from dadiff.reporting.statistics import Draws
 PRESETS = ("_fixed", "_unchecked")  # what they set is an axis of its own
 ALIASES = ("projector.initial_state",)  # stored as `initial_state`, too
 FIRST = (
-    *("task", "projector", "projector.features", "enforcement", "initial_state", "recording.length"),
-    *("system.process_noise", "denoiser"),
+    *("task", "projector", "projector.features", "enforcement", "enforcement.spread", "initial_state"),
+    *("recording.length", "system.process_noise", "denoiser"),
 )
 LEVELS = ("robot", "case", "sample", "t")
 

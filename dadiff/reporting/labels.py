@@ -45,6 +45,7 @@ WORDS: dict[str, dict[str, str]] = {
     "initial_state": {"fixed": "x(0) fixed", "free": "x(0) free"},
     "sampler.last_step_noise": {"True": "with last-step noise", "False": "without last-step noise"},
     "denoiser": {"gaussian": "exact denoiser"},
+    "enforcement.spread": {"True": "drawn from its law", "False": ""},
     "task": {"manoeuvre_pendulums": "pendulums", "manoeuvre_reachers": "reachers"},
     "projector.features": {
         "[]": "",
@@ -184,16 +185,30 @@ def axis_name(axis: str) -> str:
 def method_name(axes: Mapping[str, Any], shown: Iterable[str] = ()) -> str:
     """A method by its projector, and by those of the axes in `shown` that it has.
 
+    Where enforcements are told apart and projectors are not, it goes by its enforcement.
+
     Example:
         >>> method_name({"projector": "hankel", "recording.length": 100}, ["recording.length"])
         'Hankel HH†, S = 100'
+        >>> method_name({"projector": "known", "enforcement": "none", "sampler.num_steps": 1}, ["enforcement"])
+        'vanilla'
     """
-    projector = str(axes.get("projector", "?"))
-    words = [] if shown and "projector" not in axes else [PROJECTORS.get(projector, projector)]
-    for axis in shown:
-        if axis in axes and axis != "projector" and axes[axis] is not None:
-            words.append(axis_value(axis, axes[axis]))
-    return ", ".join(word for word in words if word)
+    shown = list(shown)
+    by_enforcement = "enforcement" in shown and "projector" not in shown and axes.get("enforcement") is not None
+    words = (
+        []
+        if by_enforcement or (shown and "projector" not in axes)
+        else [value_name("projector", axes.get("projector", "?"))]
+    )
+    words += [_axis_word(axis, axes, shown) for axis in shown if axes.get(axis) is not None and axis != "projector"]
+    return ", ".join(filter(None, words))
+
+
+def _axis_word(axis: str, axes: Mapping[str, Any], shown: list[str]) -> str:
+    """One condition of a method in words; a sampler of one step goes by that."""
+    if axis in ("sampler", "sampler.num_steps") and axes.get("sampler.num_steps") == 1:
+        return "one call" if axis == "sampler" or "sampler" not in shown else ""
+    return axis_value(axis, axes[axis])
 
 
 def axis_value(axis: str, value: Any) -> str:
@@ -226,7 +241,20 @@ def number(value: float | None, digits: int = 3) -> str:
 
 
 def with_interval(value: float, low: float, high: float) -> str:
-    """A value and its 95 % interval, if it has any width."""
+    """A value and its 95 % interval, if it has any width, with as many digits as tell its ends apart.
+
+    Example:
+        >>> with_interval(1.0058, 1.0041, 1.0079)
+        '1.0058 [1.0041, 1.0079]'
+    """
     if low == high or math.isnan(low):
         return number(value)
-    return f"{number(value)} [{number(low)}, {number(high)}]"
+    digits = _telling(value, low, high)
+    return f"{number(value, digits)} [{number(low, digits)}, {number(high, digits)}]"
+
+
+def _telling(value: float, low: float, high: float) -> int:
+    """Significant digits that show the width of an interval with two of its own; 3 to 6."""
+    if not (math.isfinite(high) and value > 0):
+        return 3
+    return min(max(3, math.floor(math.log10(value)) - math.floor(math.log10(high - low)) + 2), 6)

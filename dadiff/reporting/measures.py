@@ -15,7 +15,7 @@ import pandas as pd
 from scipy.special import ndtri
 
 from dadiff.reporting.aggregation import Evidence, Method, Runs, has_metric, pair, pairs
-from dadiff.reporting.labels import FLOORS, axis_value, method_name, metric_name, with_interval
+from dadiff.reporting.labels import FLOORS, axis_value, column_name, method_name, metric_name, with_interval
 from dadiff.reporting.selection import Selector
 from dadiff.reporting.statistics import Band, Draws, Estimate, mean, ratio, ratio_band
 
@@ -81,15 +81,20 @@ def level(evidence: Evidence, methods: list[Method], shown: list[str], *, metric
 
 
 def ratio_to(
-    evidence: Evidence, methods: list[Method], shown: list[str], *, metric: str, against: Selector
+    evidence: Evidence, methods: list[Method], shown: list[str], *, metric: str, against: Selector, exact: bool = False
 ) -> list[Measured]:
-    """The mean of a metric over that of a paired method."""
+    """The mean of a metric over that of a paired method.
+
+    Args:
+        exact: the metric is in closed form; no chance enters it, so that the interval is the value.
+    """
     out: list[Measured] = []
     for method, other in _pairs(evidence, methods, shown, out, metric, against):
         own, theirs = pair(method, other)
         estimate = ratio(own.scalars(metric), theirs.scalars(metric), FLOORS.get(metric, 0))
+        estimate = Estimate(*(estimate.value,) * 3) if exact else estimate
         text = (
-            f"{metric_name(metric)} {_words(estimate)} times that of {_name_of(other, against)}{_lost(method, other)}"
+            f"{column_name(metric)} {_words(estimate)} times that of {_name_of(other, against)}{_lost(method, other)}"
         )
         out.append(Measured(method_name(method.axes, shown), method.axes, estimate, text, _keys(own, theirs)))
     return out
@@ -250,7 +255,7 @@ def _lost(*methods: Method) -> str:
 
 
 def _name_of(other: Method, against: Selector) -> str:
-    return ", ".join(axis_value(axis, other.axes[axis]) for axis in against if axis in other.axes)
+    return method_name({axis: other.axes[axis] for axis in against if axis in other.axes}, against)
 
 
 def _words(estimate: Estimate) -> str:
