@@ -5,8 +5,10 @@ from __future__ import annotations
 import contextlib
 import csv
 import hashlib
+import io
 import itertools
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -18,6 +20,7 @@ import numpy as np
 import pytest
 import yaml
 from made_up import MadeUp, example_arrays
+from matplotlib.figure import Figure
 from matplotlib.markers import CARETDOWN
 
 from dadiff.errors import ConfigError, StoreError
@@ -567,6 +570,31 @@ def test_the_json_keeps_its_words_and_has_a_list_of_numbers_on_a_line():
     assert json.loads(text) == {**content, "values": [1.23457, 2, None]}
     deep = {"figures": {"errors": {"content": {"values": [1.0, 2.0], "labels": ["a", "FF†"]}}}}
     assert '"content": {"values":[1.0,2.0],"labels":["a","FF†"]}' in slim.numbers(deep)
+
+
+def test_the_json_of_a_figure_has_the_digits_that_are_seen_and_leaves_axes_to_the_configurations():
+    content = {"curve": [1.234567] * 9, "few": [1.234567], "value": 1.2345678, "axes": {"projector": "known"}}
+    (found,) = json.loads(slim.numbers({"figures": {"errors": {"content": content}}}))["figures"].values()
+    assert found["content"] == {"curve": [1.235] * 9, "few": [1.23457], "value": 1.23457}
+
+
+def test_many_dots_are_strokes_at_their_places():
+    figure = Figure()
+    places = np.random.default_rng(0).random((2, 50))
+    figure.subplots().plot(*places, ".", mew=0, alpha=0.6)
+    stream = io.BytesIO()
+    figure.savefig(stream, format="svg")
+    small = slim.drawing(stream.getvalue())
+    pairs = re.findall(
+        r'<use xlink:href="#m\w+" x="([\d.]+)" y="([\d.]+)" style="fill: #1f77b4', stream.getvalue().decode()
+    )
+    layers = re.findall(r'<path d="((?:m[^"hLC]+h0)+)"', small.decode())
+    assert len(pairs) == 50
+    assert len(layers) == slim.LAYERS
+    for k, layer in enumerate(layers):
+        steps = np.array([step.split() for step in re.findall("m([^h]+)h0", layer)], float)
+        np.testing.assert_allclose(np.cumsum(steps, axis=0), np.array(pairs[k :: slim.LAYERS], float), atol=0.0051)
+    assert slim.drawing(small) == small
 
 
 def test_a_drawing_in_fewer_bytes_is_the_same_drawing():

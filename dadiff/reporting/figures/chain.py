@@ -9,8 +9,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from dadiff.reporting.aggregation import Evidence, varying
-from dadiff.reporting.figures.style import legend_below, letter, log_axis, looks_of, panels, tag
-from dadiff.reporting.labels import method_name
+from dadiff.reporting.figures.style import label_ends, legend_below, letter, log_axis, looks_of, panels, tag
+from dadiff.reporting.labels import ROUNDING, method_name
 from dadiff.reporting.selection import Selector
 from dadiff.reporting.sources import ReportedRun
 
@@ -44,12 +44,16 @@ class Chain:
         """Sampling runs from left to right; distances are logarithmic, shares are from 0 to 1."""
         figure, axes = panels(len(PANELS), columns)
         for ax, (name, title) in zip(axes, PANELS.items(), strict=True):
+            ends = []
             for trace, look in zip(self.traces, looks_of([trace.axes for trace in self.traces]), strict=True):
                 (line,) = ax.plot(
                     trace.steps, trace.values[name], lw=1.2, ls=look.line, label=trace.label, markevery=0.12, ms=4,
                     **look.points,
                 )  # fmt: skip
                 tag(trace.label, line)
+                ends += (
+                    [(trace.label, trace.values[name][-1], look.colour)] if trace.values[name][-1] > ROUNDING else []
+                )
             ax.set_xscale("symlog", linthresh=10)  # most happens in the last steps
             ax.set_xticks([0, 5, 10, 100, 1000], ["0", "5", "10", "100", "1000"])
             ax.set_xlim(max(trace.steps.max() for trace in self.traces), -0.5)
@@ -57,6 +61,8 @@ class Chain:
             ax.set_title(title)
             if name.endswith("support"):
                 log_axis(ax, "y")
+                if columns > 1:
+                    label_ends(ax, ends)
             else:
                 ax.set_ylim(-0.03, 1.03)
         letter(axes)
@@ -78,7 +84,17 @@ def _trace(cell: ReportedRun, label: str, axes: dict[str, Any]) -> Trace:
     table = cell.table("chain")
     stages = {name: table[table["stage"] == name].set_index("i") for name in ("predict", "project")}
     last = stages["project"] if len(stages["project"]) else stages["predict"]
-    steps = stages["predict"].index.to_numpy()
+    steps = _seen(stages["predict"].index.to_numpy())
     values = {name: last[name].reindex(steps).to_numpy() for name in ("on_support", "off_support")}
     grew = {f"grew_{name}": part["grew"].reindex(steps).to_numpy() for name, part in stages.items()}
     return Trace(label, axes, steps, values | grew)
+
+
+def _seen(steps: np.ndarray) -> np.ndarray:
+    """Of steps from noise to plan, those that the axis tells apart: all late ones, one in `APART` early."""
+    place = np.floor(np.log(np.maximum(steps, EVERY) / EVERY) / APART)
+    return steps[(np.diff(place, append=-1) != 0) | (steps < EVERY)]
+
+
+EVERY, APART = 50, 0.02
+"""Steps below the first are all drawn; above it, one in two percent."""

@@ -18,7 +18,7 @@ from dadiff.reporting.labels import FLOORS, PROJECTORS, column_name, method_name
 from dadiff.reporting.selection import Selector
 from dadiff.reporting.statistics import Estimate, mean
 
-MANY_DOTS = 2200
+MANY_DOTS = 6000
 """In a panel; more are drawn as one picture in svg and pdf, which keeps the files small."""
 
 
