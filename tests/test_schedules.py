@@ -82,3 +82,8 @@ def test_a_falling_beta_fails_the_third_condition():
 def test_values_out_of_range_are_refused_in_one_line(make, message):
     with pytest.raises(ConfigError, match=rf"^schedule: [^\n]*{message}[^\n]*$"):
         make()
+
+
+def test_a_schedule_whose_beta_stays_the_same_does_not_fall():
+    assert Schedule(np.array([0.0, 0.1, 0.1, 0.2])).conditions()["C3"]
+    assert not Schedule(np.array([0.0, 0.1, 0.05])).conditions()["C3"]
