@@ -120,7 +120,7 @@ def collect(
 
     def panel(metric: str, value: Any) -> Panel:
         here = [m for m in alive if (by is None or m.axes.get(by) == value) and has_metric(m.finished, metric)]
-        condition = axis_value(by, value) if by and len(values) > 1 else ""
+        condition = axis_value(by, value) if by and value is not None and len(values) > 1 else ""
         curves = [_curve(method, metric, [name for name in shown if name != by]) for method in here]
         return Panel(metric, condition, _merged(curves))
 
