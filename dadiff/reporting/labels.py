@@ -247,7 +247,7 @@ def with_interval(value: float, low: float, high: float) -> str:
         >>> with_interval(1.0058, 1.0041, 1.0079)
         '1.0058 [1.0041, 1.0079]'
     """
-    if low == high or math.isnan(low):
+    if math.isnan(low) or math.isclose(low, high, rel_tol=1e-6):
         return number(value)
     digits = _telling(value, low, high)
     return f"{number(value, digits)} [{number(low, digits)}, {number(high, digits)}]"
