@@ -200,7 +200,7 @@ def test_latex_sets_numbers_and_signs():
 
 @pytest.mark.parametrize("name", SWEEPS)
 def test_figures_through_their_data(name):
-    """What is drawn is what was collected: a line, marker or patch for each method, and its label in the legend."""
+    """What is drawn is what was collected: a line, marker or patch for each method, and its label there or in the legend."""
     content = build(for_sweep(name), evidence(name), [], "")
     drawn = [part for part in content.figures if not part.empty]
     assert len(drawn) >= 2
@@ -210,6 +210,7 @@ def test_figures_through_their_data(name):
         assert all(ax.get_title() or ax.get_title("left") or ax.get_xlabel() for ax in figure.axes), part.item.id
         wanted = {item.label for item in _labelled(part.content)}
         legend = {text.get_text() for legend in figure.legends for text in legend.get_texts()}
+        legend |= {str(text.get_gid()).split(":", 1)[-1] for ax in figure.axes for text in ax.texts}
         ticks = {text.get_text() for ax in figure.axes for text in ax.get_yticklabels()}
         titles = {text.replace("\n", " ") for ax in figure.axes for text in (ax.get_title(), ax.get_title("left"))}
         assert wanted <= legend | ticks | {title.removeprefix(title[: title.find(") ") + 2]) for title in titles} | {

@@ -258,3 +258,16 @@ def _telling(value: float, low: float, high: float) -> int:
     if not (math.isfinite(high) and value > 0):
         return 3
     return min(max(3, math.floor(math.log10(value)) - math.floor(math.log10(high - low)) + 2), 6)
+
+
+def joint(one: str, other: str) -> str:
+    """A name for two methods that are drawn as one; what they share in front is said once.
+
+    Example:
+        >>> joint("vanilla", "known FF†, ddpm"), joint("known FF†, x(0) free, ddpm", "known FF†, x(0) free, ddim")
+        ('vanilla = known FF†, ddpm', 'known FF†, x(0) free, ddpm = ddim')
+    """
+    words, rest = one.split(" = ")[0].split(", "), other.split(", ")
+    while len(rest) > 1 and words and words[0] == rest[0]:
+        words, rest = words[1:], rest[1:]
+    return f"{one} = {', '.join(rest)}"

@@ -72,7 +72,7 @@ class Against:
 
     def draw(self, columns: int) -> Figure:
         """One panel a metric and condition, both axes logarithmic."""
-        width = PANEL_WIDTH * (ALONE if columns > 1 and len(self.panels) == 1 else 1)
+        width = PANEL_WIDTH * ALONE if columns > 1 else PANEL_WIDTH
         figure, axes = panels(len(self.panels), columns, width=width)
         for ax, panel in zip(axes, self.panels, strict=True):
             _draw_panel(ax, panel, labelled=columns > 1)
@@ -111,7 +111,7 @@ def _draw_panel(ax: Axes, panel: Panel, *, labelled: bool) -> None:
     if values and min(values) >= 0:
         log_axis(ax, "y")
         if labelled:
-            label_ends(ax, [(line.label, end, look.colour) for line, look, end in _ends(panel)])
+            label_ends(ax, [(line.label, end, look) for line, look, end in _ends(panel)])
     log_axis(ax, "x")
 
 

@@ -2,15 +2,29 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from dadiff.reporting.aggregation import Evidence, varying
-from dadiff.reporting.figures.style import label_ends, legend_below, letter, log_axis, looks_of, panels, tag
-from dadiff.reporting.labels import ROUNDING, method_name
+from dadiff.reporting.figures.style import (
+    NAMED_HEIGHT,
+    NAMED_WIDTH,
+    Look,
+    at_the_edge,
+    drawn,
+    label_ends,
+    legend_below,
+    letter,
+    log_axis,
+    looks_of,
+    panels,
+    tag,
+)
+from dadiff.reporting.labels import ROUNDING, joint, method_name
 from dadiff.reporting.selection import Selector
 from dadiff.reporting.sources import ReportedRun
 
@@ -42,32 +56,54 @@ class Chain:
 
     def draw(self, columns: int) -> Figure:
         """Sampling runs from left to right; distances are logarithmic, shares are from 0 to 1."""
-        figure, axes = panels(len(PANELS), columns)
+        size = {"width": NAMED_WIDTH, "height": NAMED_HEIGHT} if columns > 1 else {}
+        figure, axes = panels(len(PANELS), columns, **size)
         for ax, (name, title) in zip(axes, PANELS.items(), strict=True):
-            ends = []
-            for trace, look in zip(self.traces, looks_of([trace.axes for trace in self.traces]), strict=True):
-                (line,) = ax.plot(
-                    trace.steps, trace.values[name], lw=1.2, ls=look.line, label=trace.label, markevery=0.12, ms=4,
-                    **look.points,
-                )  # fmt: skip
-                tag(trace.label, line)
-                ends += (
-                    [(trace.label, trace.values[name][-1], look.colour)] if trace.values[name][-1] > ROUNDING else []
-                )
-            ax.set_xscale("symlog", linthresh=10)  # most happens in the last steps
-            ax.set_xticks([0, 5, 10, 100, 1000], ["0", "5", "10", "100", "1000"])
-            ax.set_xlim(max(trace.steps.max() for trace in self.traces), -0.5)
-            ax.set_xlabel("diffusion step i")
+            self._draw_panel(ax, name, named=columns > 1)
             ax.set_title(title)
-            if name.endswith("support"):
-                log_axis(ax, "y")
-                if columns > 1:
-                    label_ends(ax, ends)
-            else:
-                ax.set_ylim(-0.03, 1.03)
         letter(axes)
         legend_below(figure, axes)
         return figure
+
+    def _draw_panel(self, ax: Axes, name: str, *, named: bool) -> None:
+        looks = looks_of([trace.axes for trace in self.traces])
+        distance, ends = name.endswith("support"), []
+        for trace, look in _distinct(self.traces, looks, name):
+            values = drawn(trace.values[name]) if distance else trace.values[name]
+            (line,) = ax.plot(
+                trace.steps, values, lw=1.2, ls=look.line, label=trace.label, markevery=0.12, ms=4, **look.points
+            )
+            tag(trace.label, line)
+            if distance:
+                at_the_edge(ax, trace.steps, trace.values[name], look, trace.label)
+            ends.append((trace.label, float(np.nan_to_num(trace.values[name][-1])), look))
+        ax.set_xscale("symlog", linthresh=10)  # most happens in the last steps
+        ax.set_xticks([0, 5, 10, 100, 1000], ["0", "5", "10", "100", "1000"])
+        ax.set_xlim(max(trace.steps.max() for trace in self.traces), -0.5)
+        ax.set_xlabel("diffusion step i")
+        if distance:
+            log_axis(ax, "y")
+        else:
+            ax.set_ylim(-0.03, 1.03)
+        if named:
+            label_ends(ax, ends)
+
+
+def _distinct(traces: list[Trace], looks: list[Look], name: str) -> list[tuple[Trace, Look]]:
+    """Traces that no eye can tell apart in this panel as one, named after all of them."""
+    found: list[tuple[Trace, Look]] = []
+    for trace, look in zip(traces, looks, strict=True):
+        for index, (other, first) in enumerate(found):
+            if _coincide(trace.values[name], other.values[name]):
+                found[index] = replace(other, label=joint(other.label, trace.label)), first
+                break
+        else:
+            found.append((trace, look))
+    return found
+
+
+def _coincide(values: np.ndarray, others: np.ndarray) -> bool:
+    return values.shape == others.shape and np.allclose(values, others, rtol=0.02, atol=ROUNDING, equal_nan=True)
 
 
 def collect(evidence: Evidence, *, cells: Selector) -> Chain:

@@ -11,6 +11,8 @@ from matplotlib.figure import Figure
 
 from dadiff.reporting.aggregation import Evidence, Method, has_metric, varying
 from dadiff.reporting.figures.style import (
+    NAMED_HEIGHT,
+    NAMED_WIDTH,
     at_the_edge,
     drawn,
     headline,
@@ -22,7 +24,7 @@ from dadiff.reporting.figures.style import (
     panels,
     tag,
 )
-from dadiff.reporting.labels import PROJECTORS, ROUNDING, axis_value, method_name, metric_name, number
+from dadiff.reporting.labels import PROJECTORS, ROUNDING, axis_value, joint, method_name, metric_name, number
 from dadiff.reporting.selection import Selector
 from dadiff.reporting.statistics import Band, band
 
@@ -56,7 +58,8 @@ class ErrorsOverTime:
 
     def draw(self, columns: int) -> Figure:
         """One panel a metric, logarithmic, methods in the same order as in the legend."""
-        figure, axes = panels(len(self.panels), columns)
+        size = {"width": NAMED_WIDTH, "height": NAMED_HEIGHT} if columns > 1 else {}
+        figure, axes = panels(len(self.panels), columns, **size)
         for ax, panel in zip(axes, self.panels, strict=True):
             _draw_panel(ax, panel, self.marked, labelled=columns > 1)
         letter(axes)
@@ -94,7 +97,7 @@ def _draw_panel(ax: Axes, panel: Panel, marked: list[int], *, labelled: bool) ->
         tag(curve.label, line, values=True)
         tag(curve.label, area)
         at_the_edge(ax, t, curve.band.value, look, curve.label)
-        ends += [(curve.label, curve.band.value[shown][-1], look.colour)] if shown.any() else []
+        ends.append((curve.label, curve.band.value[shown][-1] if shown.any() else 0.0, look))
     for t_marked in marked:
         ax.axvline(t_marked, color="#888888", lw=0.8, ls=":", zorder=0)
     log_axis(ax, "y")
@@ -135,7 +138,7 @@ def _merged(curves: list[Curve]) -> list[Curve]:
     for curve in curves:
         for index, other in enumerate(distinct):
             if np.allclose(curve.band.value, other.band.value, rtol=COINCIDE, atol=ROUNDING, equal_nan=True):
-                distinct[index] = replace(other, label=f"{other.label} = {curve.label}")
+                distinct[index] = replace(other, label=joint(other.label, curve.label))
                 break
         else:
             distinct.append(curve)

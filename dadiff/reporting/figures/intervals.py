@@ -74,7 +74,7 @@ def _draw(ax: Axes, lines: list[Line], expert: Line | None, against: Against, *,
     log_axis(ax, "y")
     if labelled:
         looks = looks_of([line.axes for line in lines])
-        ends = [(line.label, line.cost[-1].value, look.colour) for line, look in zip(lines, looks, strict=True)]
+        ends = [(line.label, line.cost[-1].value, look) for line, look in zip(lines, looks, strict=True)]
         label_ends(ax, [end for end in ends if end[1] > ROUNDING])
 
 

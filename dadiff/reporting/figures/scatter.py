@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 from matplotlib.figure import Figure
 
 from dadiff.reporting.aggregation import Evidence, Method, has_metric, varying
-from dadiff.reporting.figures.style import PANEL_WIDTH, legend_below, log_axis, looks_of, panels, tag
+from dadiff.reporting.figures.style import Look, label_points, legend_below, log_axis, looks_of, panels, tag
 from dadiff.reporting.labels import FLOORS, ROUNDING, method_name, metric_name
 from dadiff.reporting.selection import Selector
 from dadiff.reporting.statistics import Estimate, mean
@@ -37,24 +38,48 @@ class Scatter:
 
     def draw(self, columns: int) -> Figure:
         """One panel with both axes logarithmic."""
-        width = 6.6 if columns > 1 else PANEL_WIDTH
-        figure, (ax,) = panels(1, columns, width=width, height=3.1 + 0.18 * len(self.points) / min(columns, 2))
-        for point, look in zip(self.points, looks_of([point.axes for point in self.points], lines=False), strict=True):
+        size = {"width": WIDTH, "height": HEIGHT} if columns > 1 else {"height": 3.1 + 0.18 * len(self.named)}
+        figure, (ax,) = panels(1, columns, **size)
+        looks = looks_of([point.axes for point in self.points], lines=False)
+        for point, own in zip(self.points, looks, strict=True):
+            look = own if point in self.named else OTHERS
             bars = [[[e.value - e.low], [e.high - e.value]] for e in (point.x, point.y)]
-            x, y = (max(e.value, ROUNDING) for e in (point.x, point.y))
+            x, y = _shown(point.x), _shown(point.y)
             whiskers = ax.errorbar(x, y, bars[1], bars[0], fmt="none", color=look.colour, capsize=2, lw=1)
-            (mark,) = ax.plot(x, y, ls="", ms=7, label=point.label, **look.points)
+            label = point.label if point in self.named else "_"
+            (mark,) = ax.plot(x, y, ls="", ms=7, label=label, zorder=2 + (point in self.named), **look.points)
             tag(point.label, mark, values=True)
             tag(point.label, *whiskers.get_children())
         if self.diagonal:
             ends = [end([e.value for p in self.points for e in (p.x, p.y)]) for end in (min, max)]
-            ax.plot(ends, ends, color="#888888", lw=0.8, ls=":", zorder=0)
+            line = np.geomspace(*(max(end, ROUNDING) for end in ends))
+            ax.plot(line, line, color="#888888", lw=0.8, ls=":", zorder=0)
         log_axis(ax, "x")
         log_axis(ax, "y")
         ax.set_xlabel(metric_name(self.x))
         ax.set_ylabel(metric_name(self.y))
-        legend_below(figure, [ax])
+        if columns > 1:
+            found = zip(self.points, looks, strict=True)
+            label_points(ax, [(p.label, _shown(p.x), _shown(p.y), look) for p, look in found if p in self.named])
+        else:
+            legend_below(figure, [ax])
         return figure
+
+    @property
+    def named(self) -> list[Point]:
+        """All points, or of many the best; the others are grey."""
+        if len(self.points) <= MOST_NAMED:
+            return self.points
+        return sorted(self.points, key=lambda point: point.y.value)[:BEST]
+
+
+WIDTH, HEIGHT = 9.6, 3.4
+MOST_NAMED, BEST = 12, 5
+OTHERS = Look("#8c8c8c", "o", "-", "full")
+
+
+def _shown(estimate: Estimate) -> float:
+    return max(estimate.value, ROUNDING)
 
 
 def collect(evidence: Evidence, *, x: str, y: str, cells: Selector, diagonal: bool = False) -> Scatter:

@@ -14,9 +14,10 @@ import io
 import itertools
 import math
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol
+from weakref import WeakKeyDictionary
 
 import matplotlib
 import numpy as np
@@ -50,6 +51,7 @@ VARIANTS = (((0, (2, 1.5)), "left"), ((0, (6, 1.5)), "bottom"), ((0, (3, 1, 1, 1
 OTHER = ("#2a6c8c", "X")
 SPARE = ("*", "h", "p", "<", ">", "8", "d", "H")
 PANEL_WIDTH, PANEL_HEIGHT = 3.7, 2.75
+NAMED_WIDTH, NAMED_HEIGHT = 5.2, 2.3  # of a panel with names at its curves
 CHARACTER = 0.072  # inches that a character of a legend takes, about
 LEGEND_LINE = 0.17  # inches of height that a line of a legend takes
 RC: dict[Any, Any] = {
@@ -157,30 +159,79 @@ def at_the_edge(ax: Axes, x: np.ndarray, values: np.ndarray, look: Look, label: 
         tag(label, marks)
 
 
-def label_ends(ax: Axes, ends: Sequence[tuple[str, float, str]]) -> None:
-    """Names at the right ends of curves: (label, y, colour), moved apart where they would overlap."""
-    if not 0 < len(ends) <= MOST_LABELS:
-        return
-    low, high = (math.log10(y) for y in ax.get_ylim())
-    ordered = sorted(ends, key=lambda end: end[1])
-    places = _apart([(math.log10(y) - low) / (high - low) for _, y, _ in ordered], LABEL_GAP)
-    look: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points", "fontsize": 7, "va": "center"}
-    for (label, _, colour), place in zip(ordered, places, strict=True):
-        square = ax.annotate("■", (1, place), (3, 0), color=colour, **look)
-        tag(label, square, ax.annotate(label, (1, place), (12, 0), **look))
+def label_ends(ax: Axes, ends: Sequence[tuple[str, float, Look]]) -> None:
+    """Names at the right ends of curves: (label, y, look), moved apart where they would overlap.
+
+    Curves that end below the axis are named at its lower edge. More names than fit are left to the legend.
+    """
+    names = ["\n".join(textwrap.wrap(label, WRAPPED)) for label, _, _ in ends]
+    if 0 < sum(1 + name.count("\n") for name in names) <= MOST_LINES:
+        _name(ax, [label for label, _, _ in ends], lambda ax: _place_ends(ax, ends))
 
 
-MOST_LABELS, LABEL_GAP = 6, 0.075
+def _place_ends(ax: Axes, ends: Sequence[tuple[str, float, Look]]) -> None:
+    tagged = {label for handle, label in zip(*ax.get_legend_handles_labels(), strict=True) if _tagged(handle)}
+    ordered = sorted(((_place(ax, y), label, look) for label, y, look in ends), key=lambda end: end[0])
+    names = ["\n".join(textwrap.wrap(label, WRAPPED)) for _, label, _ in ordered]
+    places = _apart([place for place, _, _ in ordered], [LABEL_GAP * (1 + name.count("\n")) for name in names])
+    style: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points", "fontsize": 7, "va": "center"}
+    for (_, label, look), name, place in zip(ordered, names, places, strict=True):
+        square = "□" if look.fill == "none" else "■"
+        tag(label, ax.annotate(square, (1, place), (3, 0), color=look.colour, **style))
+        text = ax.annotate(name, (1, place), (12, 0), **style)
+        text.set_gid(f"{CHOICE if label in tagged else TAG}{label}")
 
 
-def _apart(places: list[float], gap: float) -> list[float]:
-    """Ascending places at least a gap from one another, moved up and then, from the top, down."""
-    for index in range(1, len(places)):
-        places[index] = max(places[index], places[index - 1] + gap)
+def _place(ax: Axes, y: float) -> float:
+    """Where a value lies on an axis, from 0 at its lower to 1 at its upper edge."""
+    low, high = ax.get_ylim()
+    if ax.get_yscale() == "log":
+        low, high, y = math.log10(low), math.log10(high), math.log10(max(y, low))
+    return min(max((y - low) / (high - low), 0.0), 1.0)
+
+
+def label_points(ax: Axes, points: Sequence[tuple[str, float, float, Look]]) -> None:
+    """Names to the right of points (label, x, y, look), moved apart where they would overlap; room is made for them."""
+    low, high = ax.get_xlim()
+    ax.set_xlim(low, high * (high / low) ** POINT_ROOM)
+    _name(ax, [label for label, *_ in points], lambda ax: _place_points(ax, points))
+
+
+def _place_points(ax: Axes, points: Sequence[tuple[str, float, float, Look]]) -> None:
+    low, high = map(math.log10, ax.get_xlim())
+    ordered = sorted(points, key=lambda point: point[2])
+    places = _apart([_place(ax, y) for _, _, y, _ in ordered], [POINT_GAP] * len(ordered))
+    for (label, x, y, look), place in zip(ordered, places, strict=True):
+        line = {"arrowstyle": "-", "color": look.colour, "lw": 0.6, "shrinkA": 0, "relpos": (0, 0.5)}
+        beside = (math.log10(x) - low) / (high - low) + 0.03, place
+        text = ax.annotate(
+            label, (x, y), beside, textcoords="axes fraction", fontsize=7.5, va="center", arrowprops=line
+        )
+        text.set_gid(f"{CHOICE}{label}")
+
+
+def _name(ax: Axes, labels: Sequence[str], place: Callable[[Axes], None]) -> None:
+    _NAMED[ax] = set(labels), place
+    place(ax)
+
+
+_NAMED: WeakKeyDictionary[Axes, tuple[set[str], Callable[[Axes], None]]] = WeakKeyDictionary()
+"""What is named in a panel, and how it is placed, which is done anew when an axis becomes linear."""
+
+POINT_GAP, POINT_ROOM = 0.062, 0.3
+MOST_LINES, LABEL_GAP, WRAPPED = 12, 0.075, 46
+
+
+def _apart(places: list[float], heights: list[float]) -> list[float]:
+    """Ascending places moved up and then, from the top, down, until what has these heights does not overlap."""
+    gaps = [(one + other) / 2 for one, other in itertools.pairwise(heights)]
+    places[:1] = [max(place, (height - LABEL_GAP) / 2) for place, height in zip(places[:1], heights, strict=False)]
+    for index, gap in enumerate(gaps):
+        places[index + 1] = max(places[index + 1], places[index] + gap)
     top = 1.0
     for index in reversed(range(len(places))):
         places[index] = min(places[index], top)
-        top = places[index] - gap
+        top = places[index] - (gaps[index - 1] if index else 0)
     return places
 
 
@@ -207,8 +258,13 @@ def letter(axes: list[Axes]) -> None:
 
 
 def legend_below(figure: Figure, axes: list[Axes]) -> None:
-    """One legend for all panels, under them, each label once, in as many columns as fit."""
-    entries = {label: handle for ax in axes for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
+    """One legend for all panels, under them, each label once, in as many columns as fit; not what stands at curves."""
+    entries = {
+        label: handle
+        for ax in axes
+        for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)
+        if label not in _NAMED.get(ax, (set(), None))[0]
+    }
     tagged = {label for label, handle in entries.items() if _tagged(handle)}
     if entries:
         widest = CHARACTER * max(map(len, entries)) + 0.55
@@ -317,4 +373,8 @@ def _to_linear(figure: Figure) -> bool:
         ax.relim()
         ax.autoscale(axis="y")
         ax.set_ylim(bottom=0)
+        if ax in _NAMED:
+            for text in [text for text in ax.texts if str(text.get_gid() or "").startswith((TAG, CHOICE))]:
+                text.remove()
+            _NAMED[ax][1](ax)
     return bool(found)
