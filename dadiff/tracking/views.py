@@ -1,4 +1,4 @@
-"""How MLflow's pages show a sweep: its runs as a table, what varies and what counts as columns, and charts.
+"""How MLflow's pages show a sweep: its runs as a table, what is sorted by and what varies as columns, and charts.
 
 MLflow keeps such states as tags of the experiment, and opens one with `?viewStateShareKey=` in the address.
 """
@@ -12,8 +12,9 @@ from urllib.parse import quote
 
 from dadiff.store import Sweep
 
-COLUMNS = ("cost_ratio", "planned_state_error")
-"""Metrics beside what varies. MLflow shows columns by name, metrics first: the first of these is what is sorted by."""
+SORTED = "cost_ratio"
+"""What runs are sorted by, and the one metric among the columns: MLflow shows metrics before parameters in whatever
+order they are asked for, and more of them would push what varies out of a window 1,440 pixels wide."""
 
 CURVES = ("t/planned_state_error", "t/rollout_state_error", "t/gap")
 """Charted along the horizon, on logarithmic axes."""
@@ -47,11 +48,11 @@ def sweep_view(sweep: Sweep, parent: str) -> str:
     Args:
         parent: id of the run that they are nested under.
     """
-    columns = [f"metrics.`{name}`" for name in COLUMNS] + [f"params.`{name}`" for name in varying(sweep)]
+    columns = [f"metrics.`{SORTED}`"] + [f"params.`{name}`" for name in varying(sweep)]
     return json.dumps(
         {
             "searchFilter": f"tags.`mlflow.parentRunId` = '{parent}'",
-            "orderByKey": f"metrics.`{COLUMNS[0]}`",
+            "orderByKey": f"metrics.`{SORTED}`",
             "orderByAsc": True,
             "selectedColumns": columns,
             **_charts(sweep.name),
@@ -66,7 +67,7 @@ def _charts(sweep: str) -> dict[str, Any]:
     lines = {"type": "LINE", "scaleType": "log", "xAxisScaleType": "linear", "xAxisKey": "step", "lineSmoothness": 0}
     lines |= {"useGlobalXaxisKey": False, "useGlobalLineSmoothing": False, "range": {}}
     charts: list[dict[str, Any]] = [{**lines, "metricKey": name, "selectedMetricKeys": [name]} for name in CURVES]
-    charts += [{"type": "BAR", "metricKey": COLUMNS[0]}]
+    charts += [{"type": "BAR", "metricKey": SORTED}]
     charts += [{"type": "IMAGE", "imageKeys": [PLANS], "step": 0, "showRunParams": False}]
     return {
         "compareRunSections": [{"uuid": section, "name": "dadiff", "display": True, "isReordered": True}],
