@@ -200,7 +200,7 @@ def test_latex_sets_numbers_and_signs():
 
 @pytest.mark.parametrize("name", SWEEPS)
 def test_figures_through_their_data(name):
-    """What is drawn is what was collected: a line, marker or patch for each method, and its label there or in the legend."""
+    """What is drawn is what was collected: a line, marker or patch for each method, and its label."""
     content = build(for_sweep(name), evidence(name), [], "")
     drawn = [part for part in content.figures if not part.empty]
     assert len(drawn) >= 2

@@ -203,7 +203,8 @@ def _place_points(ax: Axes, points: Sequence[tuple[str, float, float, Look]]) ->
     places = _apart([_place(ax, y) for _, _, y, _ in ordered], [POINT_GAP] * len(ordered))
     for (label, x, y, look), place in zip(ordered, places, strict=True):
         line = {"arrowstyle": "-", "color": look.colour, "lw": 0.6, "shrinkA": 0, "relpos": (0, 0.5)}
-        beside = (math.log10(x) - low) / (high - low) + 0.03, place
+        near = [other for _, other, level, _ in points if 1 <= other / x < CLUSTER and 1 / 10 < level / y < 10]
+        beside = (math.log10(max(near)) - low) / (high - low) + 0.03, place
         text = ax.annotate(
             label, (x, y), beside, textcoords="axes fraction", fontsize=7.5, va="center", arrowprops=line
         )
@@ -218,7 +219,7 @@ def _name(ax: Axes, labels: Sequence[str], place: Callable[[Axes], None]) -> Non
 _NAMED: WeakKeyDictionary[Axes, tuple[set[str], Callable[[Axes], None]]] = WeakKeyDictionary()
 """What is named in a panel, and how it is placed, which is done anew when an axis becomes linear."""
 
-POINT_GAP, POINT_ROOM = 0.062, 0.3
+POINT_GAP, POINT_ROOM, CLUSTER = 0.062, 0.3, 1.8
 MOST_LINES, LABEL_GAP, WRAPPED = 12, 0.075, 46
 
 
