@@ -52,7 +52,7 @@ class Scatter:
             tag(point.label, *whiskers.get_children())
         if self.diagonal:
             ends = [end([e.value for p in self.points for e in (p.x, p.y)]) for end in (min, max)]
-            line = np.geomspace(*(max(end, ROUNDING) for end in ends))
+            line = np.geomspace(max(ends[0], ROUNDING), max(ends[1], ROUNDING))
             ax.plot(line, line, color="#888888", lw=0.8, ls=":", zorder=0)
         log_axis(ax, "x")
         log_axis(ax, "y")
