@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections import Counter
 from typing import Any
@@ -149,4 +150,9 @@ def _rounded(value: Any, digits: int = DIGITS) -> Any:
         return {name: _rounded(part, digits) for name, part in value.items()}
     if isinstance(value, list):
         return [_rounded(part, digits) for part in value]
-    return float(f"{value:.{digits}g}") if isinstance(value, float) else value
+    return float(f"{value:.{digits + _beside_one(value)}g}") if isinstance(value, float) else value
+
+
+def _beside_one(value: float) -> int:
+    """Digits that a number close to 1 needs more: of costs over the optimum, what lies above 1 is read."""
+    return -math.floor(math.log10(abs(value - 1))) if 1e-9 < abs(value - 1) < 0.1 else 0
