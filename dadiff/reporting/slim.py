@@ -155,4 +155,5 @@ def _rounded(value: Any, digits: int = DIGITS) -> Any:
 
 def _beside_one(value: float) -> int:
     """Digits that a number close to 1 needs more: of costs over the optimum, what lies above 1 is read."""
-    return -math.floor(math.log10(abs(value - 1))) if 1e-9 < abs(value - 1) < 0.1 else 0
+    beside = abs(value - 1)
+    return max(-math.floor(math.log10(beside)) - 2, 0) if beside > 1e-9 else 0
