@@ -44,7 +44,7 @@ WORDS: dict[str, dict[str, str]] = {
     "enforcement": ENFORCEMENTS,
     "initial_state": {"fixed": "x(0) fixed", "free": "x(0) free"},
     "sampler.last_step_noise": {"True": "with last-step noise", "False": "without last-step noise"},
-    "denoiser": {"gaussian": "exact denoiser"},
+    "denoiser": {"gaussian": "exact denoiser", "moment_matched": "linear regression"},
     "enforcement.spread": {"True": "drawn from its law", "False": ""},
     "task": {"manoeuvre_pendulums": "pendulums", "manoeuvre_reachers": "reachers"},
     "projector.features": {
