@@ -47,6 +47,8 @@ WORDS: dict[str, dict[str, str]] = {
     "denoiser": {"gaussian": "exact denoiser", "moment_matched": "linear regression"},
     "enforcement.spread": {"True": "drawn from its law", "False": ""},
     "task": {"manoeuvre_pendulums": "pendulums", "manoeuvre_reachers": "reachers"},
+    "projector.bounds": {"ignored": "bounds ignored", "enforced": "within bounds"},
+    "projector.replay": {"True": "replayed", "False": ""},
     "projector.features": {
         "[]": "",
         "['trigonometric']": "sin, cos",

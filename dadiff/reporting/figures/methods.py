@@ -52,7 +52,9 @@ class Methods:
 
     def draw(self, columns: int) -> Figure:
         """One panel a metric."""
-        figure, axes = panels(len(self.metrics), columns, width=4.1, height=0.9 + 0.32 * len(self.rows[0]))
+        longest = max((len(row.label) for row in self.rows[0]), default=0)
+        width = 4.1 + 0.08 * max(longest - 40, 0) / min(columns, len(self.metrics))
+        figure, axes = panels(len(self.metrics), columns, width=width, height=0.9 + 0.32 * len(self.rows[0]))
         for index, (ax, metric, rows) in enumerate(zip(axes, self.metrics, self.rows, strict=True)):
             _draw_rows(ax, rows, log=self.log, below=rounding(metric))
             ax.set_title(column_name(metric) if self.above else metric_name(metric))
