@@ -11,7 +11,7 @@ from dataclasses import astuple, dataclass
 from typing import Any
 
 from dadiff.reporting.claims import Claim, Finding, conclude, decide
-from dadiff.reporting.labels import axis_value, column_name, column_value, metric_name, number, with_interval
+from dadiff.reporting.labels import column_name, column_value, method_name, metric_name, number, with_interval
 from dadiff.reporting.measures import IDENTITY
 from dadiff.reporting.statistics import Estimate
 
@@ -128,8 +128,8 @@ def unit(claim: Claim) -> str:
     """What the effect of a claim is, in words."""
     metric = metric_name(claim.options["metric"]) if "metric" in claim.options else ""
     if "against" in claim.options:
-        against = ", ".join(axis_value(axis, value) for axis, value in claim.options["against"].items())
-        return f"{metric} over that of {against}"
+        against = claim.options["against"]
+        return f"{column_name(claim.options['metric'])} over that of {method_name(against, against)}"
     words = {
         "dip": "over that three steps before and after",
         "longest_over_shortest": "at the longest over that at the shortest",
