@@ -87,6 +87,19 @@ def test_what_is_wrong_with_data_is_found_and_named(name, tmp_path):
     assert NpzRecordings(str(tmp_path), allow_mismatch=True).record(SYSTEM).notes["recording_residual"] == found.ratio
 
 
+def test_a_recording_in_one_other_unit_is_taken_where_dynamics_have_no_offset_and_it_is_said(tmp_path, caplog):
+    counts = {"states": np.round(1000 * X).astype(np.int32), "inputs": np.round(1000 * U).astype(np.int16)}
+    np.savez(tmp_path / "a.npz", **counts)
+    taken = NpzRecordings(str(tmp_path)).record(SYSTEM)
+    assert taken.notes["recording_residual"] > 100
+    assert "everything taken 0.001 times fits" in caplog.text
+    assert "the same in all units" in caplog.text
+    lifted = replace(SYSTEM, c=np.array([0, 0, 0.2, 0]))
+    np.savez(tmp_path / "a.npz", states=1000 * run(system=lifted)[0], inputs=1000 * U)
+    with pytest.raises(DataError, match="a constant offset"):
+        NpzRecordings(str(tmp_path)).record(lifted)
+
+
 @pytest.mark.parametrize("bad", ["glitch", "order", "trim"])
 def test_one_bad_file_among_many_is_found_and_named(bad, tmp_path):
     for k in range(30):

@@ -27,6 +27,9 @@ FACTORS = {0.1: "deci", 0.01: "centi", 1e-3: "milli", 10.0: "deca", 100.0: "hect
            np.pi / 180: "degrees", 180 / np.pi: "radians"}  # fmt: skip
 """By what values may have to be multiplied, and what they are in then."""
 
+EVERYTHING = "everything"
+"""How the cause begins that is one factor of states and inputs."""
+
 NOISE = (0.8, 1.3)
 """Ratios that noise leaves."""
 
@@ -183,7 +186,7 @@ def _units_of_all(seen: Seen) -> Mapping[str, float]:
         taken = f"taken {factor:.4g} times fits: other units ({unit})?"
         found[f"every input {taken}"] = seen.left(states, factor * inputs)
         found[f"every state {taken}"] = seen.left(factor * states, inputs)
-        found[f"everything {taken}"] = seen.left(factor * states, factor * inputs)
+        found[f"{EVERYTHING} {taken}"] = seen.left(factor * states, factor * inputs)
     return _as_noise(found)
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from dadiff.datasets.causes import Seen, cause_of
+from dadiff.datasets.causes import EVERYTHING, Seen, cause_of
 from dadiff.datasets.logs import Run
 from dadiff.errors import DataError
 from dadiff.systems import System, Unknown
@@ -186,7 +186,14 @@ def tell_offset(plant: Plant, runs: Sequence[Run], where: str) -> tuple[Plant, f
 
 
 def judge(
-    plant: Plant, states: np.ndarray, inputs: np.ndarray, where: str, allow_mismatch: bool, names: Sequence[str] = ()
+    plant: Plant,
+    states: np.ndarray,
+    inputs: np.ndarray,
+    where: str,
+    allow_mismatch: bool,
+    names: Sequence[str] = (),
+    *,
+    any_units: bool = False,
 ) -> float:
     """Hold trajectories against a plant. Returns the ratio of their residual to its noise.
 
@@ -195,6 +202,8 @@ def judge(
         where: the file or folder that they are from.
         allow_mismatch: warn where it would be refused.
         names: of the trajectories, where they have any.
+        any_units: warn where all that is wrong is one factor of states and inputs under dynamics without an offset:
+            these are the same in all units.
 
     Raises:
         DataError: if the ratio is `REFUSED` or more, naming the file, the place and the likely cause.
@@ -208,10 +217,18 @@ def judge(
         f"{where}: the data do not obey {plant.name}: x(t+1) - f(x(t), u(t)) is {found.ratio:.3g} times "
         f"{_held_against(plant, states, inputs)}, most {place} t = {t}{'; ' + found.cause if found.cause else ''}"
     )
-    if found.ratio >= REFUSED and not allow_mismatch:
+    if any_units and found.cause.startswith(EVERYTHING) and _homogeneous(plant, states, inputs):
+        told += "; dynamics without an offset are the same in all units, so they are learned from it as it is"
+    elif found.ratio >= REFUSED and not allow_mismatch:
         raise DataError(f"{told}; mend the data or the system, or set allow_mismatch=true")
     log.warning("%s", told)
     return found.ratio
+
+
+def _homogeneous(plant: Plant, states: np.ndarray, inputs: np.ndarray) -> bool:
+    """Whether f(2 x, 2 u) is 2 f(x, u)."""
+    x, u = states[..., :-1, :], inputs
+    return bool(np.allclose(plant.step(2 * x, 2 * u), 2 * plant.step(x, u), rtol=ROUNDING, atol=0))
 
 
 def _held_against(plant: Plant, states: np.ndarray, inputs: np.ndarray) -> str:
@@ -225,8 +242,10 @@ def _held_against(plant: Plant, states: np.ndarray, inputs: np.ndarray) -> str:
 def judge_runs(plant: Plant, runs: Sequence[Run], where: str, allow_mismatch: bool) -> float:
     """As `judge`, of runs of different lengths: the largest ratio."""
     named = [f"{where}, run {k}" if len(runs) > 1 else where for k in range(len(runs))]
-    found = [judge(plant, x[None], u[None], name, allow_mismatch) for (x, u), name in zip(runs, named, strict=True)]
-    return max(found)
+    return max(
+        judge(plant, x[None], u[None], name, allow_mismatch, any_units=True)
+        for (x, u), name in zip(runs, named, strict=True)
+    )
 
 
 def mismatch(system: System | Plant, states: np.ndarray, inputs: np.ndarray) -> Mismatch:
