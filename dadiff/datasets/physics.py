@@ -217,7 +217,7 @@ def judge(
         f"{where}: the data do not obey {plant.name}: x(t+1) - f(x(t), u(t)) is {found.ratio:.3g} times "
         f"{_held_against(plant, states, inputs)}, most {place} t = {t}{'; ' + found.cause if found.cause else ''}"
     )
-    if any_units and found.cause.startswith(EVERYTHING) and _homogeneous(plant, states, inputs):
+    if any_units and found.cause.startswith(EVERYTHING) and _same_in_all_units(plant, states, inputs):
         told += "; dynamics without an offset are the same in all units, so they are learned from it as it is"
     elif found.ratio >= REFUSED and not allow_mismatch:
         raise DataError(f"{told}; mend the data or the system, or set allow_mismatch=true")
@@ -225,10 +225,12 @@ def judge(
     return found.ratio
 
 
-def _homogeneous(plant: Plant, states: np.ndarray, inputs: np.ndarray) -> bool:
-    """Whether f(2 x, 2 u) is 2 f(x, u)."""
+def _same_in_all_units(plant: Plant, states: np.ndarray, inputs: np.ndarray) -> bool:
+    """Whether f(2 x, 2 u) is 2 f(x, u), and a noise is there to tell units by."""
     x, u = states[..., :-1, :], inputs
-    return bool(np.allclose(plant.step(2 * x, 2 * u), 2 * plant.step(x, u), rtol=ROUNDING, atol=0))
+    return bool(
+        (plant.noise > 0).all() and np.allclose(plant.step(2 * x, 2 * u), 2 * plant.step(x, u), rtol=ROUNDING, atol=0)
+    )
 
 
 def _held_against(plant: Plant, states: np.ndarray, inputs: np.ndarray) -> str:
