@@ -196,12 +196,9 @@ def method_name(axes: Mapping[str, Any], shown: Iterable[str] = ()) -> str:
         'vanilla'
     """
     shown = list(shown)
+    projector = value_name("projector", axes.get("projector", "?"))
     by_enforcement = "enforcement" in shown and "projector" not in shown and axes.get("enforcement") is not None
-    words = (
-        []
-        if by_enforcement or (shown and "projector" not in axes)
-        else [value_name("projector", axes.get("projector", "?"))]
-    )
+    words = [] if by_enforcement or (shown and "projector" not in axes) else [projector]
     words += [_axis_word(axis, axes, shown) for axis in shown if axes.get(axis) is not None and axis != "projector"]
     return ", ".join(filter(None, words))
 
