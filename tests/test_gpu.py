@@ -11,7 +11,7 @@ import pytest
 import torch
 from laws import composed, presets
 from safetensors.torch import load_file
-from test_training import Interrupt
+from test_training import CONDITION, LAYOUT, RECIPES, SCHEDULE, Interrupt
 from test_training import run as begun
 
 import dadiff
@@ -132,6 +132,17 @@ def test_a_training_sees_the_same_batches_and_ends_nearby(recipe, tmp_path):
     here, there = (executed(config, tmp_path / device, device) for device in ("cpu", "cuda"))
     assert here.key == there.key, "the device is not part of what is computed"
     np.testing.assert_allclose(there.metrics["planned_state_error"], here.metrics["planned_state_error"], rtol=2e-2)
+
+
+@pytest.mark.parametrize("recipe", RECIPES, ids=lambda recipe: type(recipe).__name__)
+def test_a_network_s_products_are_rounded_as_float32(recipe):
+    """By default a GPU convolves in TF32, with ten bits."""
+    generator = torch.Generator().manual_seed(0)
+    network = recipe.build(LAYOUT, CONDITION, SCHEDULE, generator)
+    tau, E = torch.randn(50, LAYOUT.size, dtype=torch.float64), torch.randn(50, CONDITION.size, dtype=torch.float64)
+    here = network(tau, 5, E)
+    there = network.to("cuda")(tau.cuda(), 5, E.cuda()).cpu()
+    torch.testing.assert_close(there, here, rtol=1e-5, atol=2e-6)
 
 
 def test_a_planner_plans_on_either_alike(tmp_path):

@@ -21,6 +21,8 @@ from dadiff.diffusion.schedule import Schedule
 from dadiff.errors import ShapeError
 from dadiff.trajectory import Layout, TrajectoryLayout
 
+torch.backends.cudnn.allow_tf32 = False  # or a GPU rounds what it convolves to ten bits, without a word
+
 CHUNK = 1024  # trajectories a network call holds activations for
 
 
