@@ -17,7 +17,8 @@ from safetensors.numpy import save as arrays_to_bytes
 
 import dadiff
 from dadiff.behaviours import HankelLowRank, IdentifiedSoft, Inpainting, Known, TrajectorySet
-from dadiff.denoisers import MLP, Gaussian
+from dadiff.denoisers import MLP, EncoderDecoder, Gaussian
+from dadiff.denoisers.recipes import Recipe
 from dadiff.diffusion.conditional import Conditional
 from dadiff.diffusion.enforcement import CleanEstimate
 from dadiff.diffusion.estimate import Estimate
@@ -37,11 +38,10 @@ SYSTEM, TASK, SCHEDULE = double_integrator(), LQR(), paper_linear()
 LAYOUT = SYSTEM.layout(TASK.horizon)
 
 
-def planner(network: bool = False, initial_state: str = "fixed", system: Linear = SYSTEM) -> Planner:
+def planner(network: bool | Recipe = False, initial_state: str = "fixed", system: Linear = SYSTEM) -> Planner:
     if network:
-        denoiser = MLP(width=16, blocks=1).build(
-            LAYOUT, TASK.condition(system), SCHEDULE, torch_generator(0, "initialisation")
-        )
+        recipe = MLP(width=16, blocks=1) if network is True else network
+        denoiser = recipe.build(LAYOUT, TASK.condition(system), SCHEDULE, torch_generator(0, "initialisation"))
     else:
         denoiser = Gaussian().exact(TASK.law(system), physical(LAYOUT), SCHEDULE)
     behaviour = Known(initial_state).fit(LAYOUT, system=system)
@@ -70,7 +70,7 @@ def test_a_plan_obeys_the_dynamics_and_starts_where_the_robot_is():
     np.testing.assert_allclose(plans.states, x, atol=1e-12)
 
 
-@pytest.mark.parametrize("network", [False, True])
+@pytest.mark.parametrize("network", [False, True, EncoderDecoder(channels=8, latent_dim=4)])
 def test_a_planner_from_a_file_plans_bit_for_bit_alike(tmp_path, network):
     before = planner(network)
     after = Planner.load(before.save(tmp_path / "robot.zip"))

@@ -59,6 +59,7 @@ class NetworkDenoiser(nn.Module):
         self.estimate_tau, self.estimate_output = table.estimate_tau, table.estimate_output
         self.network = network._apply(_unfilled)  # where `to_empty` would first load sympy
         initialise(self.network, generator)
+        self.network.to(memory_format=torch.channels_last)  # as its signals, else each call would copy its weights
         self.register_buffer("environment_mean", torch.zeros(condition.size))
         self.register_buffer("environment_scale", torch.ones(condition.size))
 
@@ -94,7 +95,7 @@ class NetworkDenoiser(nn.Module):
         outputs = [
             self.output(x.float(), step, e.float()) for x, e in zip(flat.split(CHUNK), E.split(CHUNK), strict=True)
         ]
-        output = torch.cat(outputs).to(tau.dtype).reshape(tau.shape)
+        output = (torch.cat(outputs) if outputs[1:] else outputs[0]).to(tau.dtype).reshape(tau.shape)
         return float(self.estimate_tau[i]) * tau + float(self.estimate_output[i]) * output
 
     def _check(self, tau: Tensor, environment: Tensor) -> None:

@@ -7,6 +7,7 @@ What the output means (clean trajectory, noise, velocity) is not their concern.
 from __future__ import annotations
 
 import math
+from functools import cache
 
 import numpy as np
 import torch
@@ -22,10 +23,15 @@ EMBEDDING = 128
 
 def step_features(step: Tensor) -> Tensor:
     """Sines and cosines of the step at wavelengths from 2 pi to 2 pi 10^4 (Vaswani et al. 2017), (B, 64)."""
-    half = STEP_FEATURES // 2
-    frequency = torch.exp(torch.arange(half, device=step.device) * (-math.log(1e4) / (half - 1)))
-    phase = step[:, None] * frequency
+    phase = step[:, None] * _frequencies(step.device)
     return torch.cat([phase.sin(), phase.cos()], dim=-1)
+
+
+@cache
+def _frequencies(device: torch.device) -> Tensor:
+    half = STEP_FEATURES // 2
+    with torch.inference_mode(False):  # as training needs them, too
+        return torch.exp(torch.arange(half, device=device) * (-math.log(1e4) / (half - 1)))
 
 
 class Condition(nn.Module):

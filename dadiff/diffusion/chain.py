@@ -104,8 +104,8 @@ def sample(
     if observe and steps[0].i < schedule.num_steps:
         observe(steps[0].i, "project", tau)
     tau0_hat = start.tau if start else torch.zeros_like(tau)
-    bar = tqdm(steps, desc="sampling", unit="step", disable=None if progress else True, leave=False)
-    for step in bar:  # line 2: for i = L, ..., 1
+    shown = tqdm(steps, desc="sampling", unit="step", disable=None, leave=False) if progress else steps
+    for step in shown:  # line 2: for i = L, ..., 1
         at = Context(step, schedule, tau, environment, project or unprojected, ask, noise, estimate, memory)
         predicted, tau0_hat = predict(at, by, tau0_hat)
         if observe:

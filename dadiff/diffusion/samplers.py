@@ -47,6 +47,17 @@ class Sampler(Protocol):
 
 
 @dataclass(frozen=True)
+class Listed:
+    """Steps that another sampler has worked out, for chains that are run again and again."""
+
+    listed: list[Step]
+
+    def steps(self, schedule: Schedule) -> list[Step]:
+        """As they are."""
+        return self.listed
+
+
+@dataclass(frozen=True)
 class DDPM:
     """Ancestral sampling, the paper's: tau_{i-1} = mu_q(tau_i, tau0_hat) + sigma_i eps.
 

@@ -35,8 +35,8 @@ def save(planner: Planner, path: Path) -> Path:
         CheckpointError: if a part of it cannot be stored, or the place cannot be written to.
     """
     description, arrays = described(planner)
-    arrays |= {WEIGHTS + name: tensor.detach().cpu().numpy() for name, tensor in planner.denoiser.state_dict().items()}
-    return write_file(path, description, arrays)
+    weights = {name: tensor.detach().cpu().contiguous() for name, tensor in planner.denoiser.state_dict().items()}
+    return write_file(path, description, arrays | {WEIGHTS + name: weight.numpy() for name, weight in weights.items()})
 
 
 def described(planner: Planner) -> tuple[dict[str, Any], dict[str, np.ndarray]]:

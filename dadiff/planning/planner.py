@@ -22,7 +22,7 @@ from dadiff.diffusion.chain import Observe, Samples, Start, sample
 from dadiff.diffusion.context import Project
 from dadiff.diffusion.enforcement import Enforcement
 from dadiff.diffusion.estimate import Estimate
-from dadiff.diffusion.samplers import Sampler
+from dadiff.diffusion.samplers import Listed, Sampler
 from dadiff.diffusion.schedule import Schedule
 from dadiff.errors import DataError, NotApplicableError, ShapeError
 from dadiff.memory import check_fits
@@ -97,6 +97,11 @@ class Planner:
     def layout(self) -> TrajectoryLayout:
         """Of the plans."""
         return self.system.layout(self.task.horizon)
+
+    @cached_property
+    def steps(self) -> Listed:
+        """The sampler's."""
+        return Listed(self.sampler.steps(self.schedule))
 
     @cached_property
     def condition(self) -> Layout:
@@ -206,7 +211,7 @@ class Planner:
     ) -> Samples:
         """The chain for conditions (*robots, plans, c), in the sampler's coordinates; see `dadiff.diffusion.chain`."""
         return sample(
-            self.sampler,
+            self.steps,
             self.schedule,
             self.denoiser,
             torch.as_tensor(E, device=self.device),
