@@ -188,15 +188,15 @@ def moved(planner: Planner, environment: np.ndarray, x: np.ndarray) -> np.ndarra
     return E
 
 
-def latencies(planner: Planner, environment: np.ndarray, count: int = TIMED_PLANS) -> np.ndarray:
+def latencies(planner: Planner, environment: np.ndarray, count: int = TIMED_PLANS, share: float = 1.0) -> np.ndarray:
     """Seconds that each of several plans for one E (*robots, c) took, one after the other; the first is not counted.
 
-    At most TIMED_SECONDS in all, and at least three plans.
+    At most a share of TIMED_SECONDS in all, and at least three plans.
     """
     seconds: list[float] = []
     planner.plan(environment)
     begun = time.perf_counter()
-    while len(seconds) < count and (len(seconds) < 3 or time.perf_counter() - begun < TIMED_SECONDS):
+    while len(seconds) < count and (len(seconds) < 3 or time.perf_counter() - begun < share * TIMED_SECONDS):
         start = time.perf_counter()
         planner.plan(environment, seed=len(seconds))
         seconds.append(time.perf_counter() - start)

@@ -9,11 +9,7 @@ from dadiff.launching.process_pool import ProcessPool
 from dadiff.launching.sweep import SweepRun
 from dadiff.store import Lease
 
-PRELOAD = (
-    *("dadiff.cli", "dadiff.running.experiment", "dadiff.tracking"),
-    *("pyarrow.parquet", "pyarrow.pandas_compat", "pydantic.dataclasses"),  # which their users import late
-)
-"""What most jobs use; not MLflow, which the launcher alone talks to."""
+PRELOAD = ("dadiff.launching.preloaded",)
 
 
 @dataclass(eq=False)

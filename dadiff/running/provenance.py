@@ -7,6 +7,7 @@ import subprocess
 import time
 from collections.abc import Mapping
 from datetime import UTC, datetime
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -61,8 +62,12 @@ def provenance(started: float, device: str | None = None) -> Provenance:
     )
 
 
+@cache
 def commit() -> str | None:
-    """The git commit of the source, with `+changes` if files differ from it; None for an installed package."""
+    """The git commit of the source, with `+changes` if files differ from it; None for an installed package.
+
+    As it was when it was first asked for, which is nearer to what was loaded than what lies there later.
+    """
     source = Path(__file__).parent.parent.parent
     if not (source / ".git").exists():
         return None
