@@ -8,7 +8,7 @@ from oracles import ipopt
 
 from dadiff.behaviours.stages import stages_of
 from dadiff.errors import ConfigError
-from dadiff.experts.ilqr import Metric, Tracking, costates, gauss_newton, solve
+from dadiff.experts.ilqr import Metric, Tracking, gauss_newton, solve
 from dadiff.systems import Linear
 from dadiff.systems.nonlinear import Nonlinear
 from dadiff.systems.quadrotors import PlanarQuadrotor
@@ -27,6 +27,33 @@ def starts(rng, *lead):
 
 def metric(layout, rng, directions):
     return Metric.diagonal(layout, rng.uniform(0.2, 2, layout.size), rng.standard_normal((layout.size, directions)))
+
+
+def times(M, v):
+    return (M @ v[..., None])[..., 0]
+
+
+def costates(problem: Tracking, tau: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The optimality conditions of feasible plans, without pins: costates lambda(1:T) and the gradients in the inputs.
+
+        lambda(T) = q(T),   lambda(t) = q(t) + A' lambda(t+1),   gradient(t) = r(t) + B' lambda(t+1) = 0
+
+    with [q; r] = C^-1 (tau - tau_ref).
+
+    Returns:
+        (*robots, plans, T, n) and (*robots, plans, T, m).
+    """
+    layout, metric = problem.layout, problem.metric
+    x, u = layout.split(tau)
+    A, B, _ = problem.system.linearise(x[..., :-1, :], u, np.arange(layout.horizon))
+    delta = tau - problem.reference
+    z = np.linalg.solve(metric.M, (delta @ metric.WU)[..., None])[..., 0]
+    q, r = layout.split(metric.times(delta) - z @ metric.WU.T)
+    costate = np.empty_like(x[..., 1:, :])
+    costate[..., -1, :] = q[..., -1, :]
+    for t in range(layout.horizon - 1, 0, -1):
+        costate[..., t - 1, :] = q[..., t, :] + times(A[..., t, :, :].swapaxes(-1, -2), costate[..., t, :])
+    return costate, r + times(B.swapaxes(-1, -2), costate)
 
 
 def references(layout, rng, *lead):

@@ -61,7 +61,7 @@ def optimum(
     import cvxpy as cp
 
     z = cp.Variable(LAYOUT.size)
-    n = LAYOUT.num_state_entries
+    n = LAYOUT.channel("x").size
     x, u = cp.reshape(z[:n], (T + 1, 4), order="C"), cp.reshape(z[n:], (T, 2), order="C")
     constraints = [x[t + 1] == A[t] @ x[t] + B[t] @ u[t] + c[t] for t in range(T)]
     above, below = np.isfinite(given.low[k]), np.isfinite(given.high[k])
@@ -141,7 +141,7 @@ def ends_at(tau: np.ndarray, distance: float, inputs: float) -> Limits:
     given = limits(tau, inputs=inputs)
     target = LAYOUT.states(given.low)[:, 0] + np.array([distance, 0, 0, 0])
     low, high = given.low.copy(), given.high.copy()
-    end = slice(LAYOUT.num_state_entries - 4, LAYOUT.num_state_entries)
+    end = np.arange(LAYOUT.size)[LAYOUT.all_states][-4:]
     low[:, end] = high[:, end] = target
     return Limits(low, high, given.normal, given.offset)
 

@@ -16,7 +16,7 @@ from laws import SYSTEMS, component, presets, tolerance, variants
 from dadiff.denoisers.exact import ExactDenoiser
 from dadiff.diffusion.chain import Samples, sample
 from dadiff.diffusion.enforcement import PostHoc
-from dadiff.diffusion.samplers import DDIM, DDPM, LEAST_SIGNAL, DPMSolver, skipped_weight, visited
+from dadiff.diffusion.samplers import DDIM, DDPM, LEAST_SIGNAL, DPMSolver, Step, visited
 from dadiff.diffusion.schedule import Schedule, cosine, paper_linear
 from dadiff.errors import ConfigError
 from dadiff.randomness import torch_generator
@@ -39,6 +39,16 @@ SCHEDULES = {name: component("schedule", name) for name in presets("schedule")}
 
 every_sampler = pytest.mark.parametrize("sampler", SAMPLERS.values(), ids=SAMPLERS.keys())
 every_schedule = pytest.mark.parametrize("schedule", SCHEDULES.values(), ids=SCHEDULES.keys())
+
+
+def skipped_weight(steps: list[Step]) -> float:
+    """The weight W of skipped clean estimates: the sample at the first call is off by at most W max |tau0_hat|."""
+    weight = 0.0
+    for step in steps:
+        if step.call:
+            return weight
+        weight = step.sample * weight + step.clean
+    return weight
 
 
 def lqr(system: Linear) -> LQR:

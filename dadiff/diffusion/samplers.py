@@ -217,13 +217,3 @@ def _skip(steps: list[Step], bound: float) -> list[Step]:
         if weight > bound:
             return [replace(skipped, call=False) for skipped in steps[:k]] + steps[k:]
     return steps
-
-
-def skipped_weight(steps: list[Step]) -> float:
-    """The weight W of skipped clean estimates: the sample at the first call is off by at most W max |tau0_hat|."""
-    weight = 0.0
-    for step in steps:
-        if step.call:
-            return weight
-        weight = step.sample * weight + step.clean
-    return weight

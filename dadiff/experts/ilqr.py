@@ -326,29 +326,6 @@ def follow(problem: Tracking, tau: np.ndarray, step: Step, a: np.ndarray) -> np.
     return layout.flatten(x, u)
 
 
-def costates(problem: Tracking, tau: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The optimality conditions of feasible plans, without pins: costates lambda(1:T) and the gradients in the inputs.
-
-        lambda(T) = q(T),   lambda(t) = q(t) + A' lambda(t+1),   gradient(t) = r(t) + B' lambda(t+1) = 0
-
-    with [q; r] = C^-1 (tau - tau_ref).
-
-    Returns:
-        (*robots, plans, T, n) and (*robots, plans, T, m).
-    """
-    layout, metric = problem.layout, problem.metric
-    x, u = layout.split(tau)
-    A, B, _ = problem.system.linearise(x[..., :-1, :], u, np.arange(layout.horizon))
-    delta = tau - problem.reference
-    z = np.linalg.solve(metric.M, (delta @ metric.WU)[..., None])[..., 0]
-    q, r = layout.split(metric.times(delta) - z @ metric.WU.T)
-    costate = np.empty_like(x[..., 1:, :])
-    costate[..., -1, :] = q[..., -1, :]
-    for t in range(layout.horizon - 1, 0, -1):
-        costate[..., t - 1, :] = q[..., t, :] + _times(A[..., t, :, :].swapaxes(-1, -2), costate[..., t, :])
-    return costate, r + _times(B.swapaxes(-1, -2), costate)
-
-
 def _times(M: np.ndarray, v: np.ndarray) -> np.ndarray:
     return (M @ v[..., None])[..., 0]
 

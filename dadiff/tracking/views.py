@@ -32,11 +32,6 @@ def table_page(experiment: str, sweep: str) -> str:
     return f"/#/experiments/{experiment}/runs?{TRAINING_PAGES}&viewStateShareKey={quote(sweep, safe='')}"
 
 
-def chart_page(experiment: str, sweep: str) -> str:
-    """The address of a sweep's charts."""
-    return f"{table_page(experiment, sweep)}&compareRunsMode=CHART"
-
-
 def run_page(experiment: str, run: str) -> str:
     """The address of one run."""
     return f"/#/experiments/{experiment}/runs/{run}?{TRAINING_PAGES}"

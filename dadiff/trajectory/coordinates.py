@@ -8,14 +8,11 @@ the metric is a choice, and this is where it is made.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
 
 import numpy as np
 
 from dadiff.errors import ConfigError
 from dadiff.trajectory.layout import Array, TrajectoryLayout
-
-CoordinateChoice = Literal["physical", "standardised"]
 
 
 @dataclass(frozen=True)

@@ -74,12 +74,6 @@ class Covariance:
         weights = self.diagonal.reshape(*self.diagonal.shape[:-1], *(1,) * (v.ndim - self.diagonal.ndim), self.size)
         return weights * v + along(self.factor, along(self.factor.swapaxes(-1, -2), v))
 
-    def plus(self, other: Covariance) -> Covariance:
-        """The sum of two."""
-        batch = np.broadcast_shapes(self.diagonal.shape, other.diagonal.shape)
-        factors = [np.broadcast_to(c.factor, (*batch, c.factor.shape[-1])) for c in (self, other)]
-        return Covariance(self.diagonal + other.diagonal, np.concatenate(factors, axis=-1))
-
     def scaled(self, a: float) -> Covariance:
         """a C with a >= 0."""
         return Covariance(a * self.diagonal, np.sqrt(a) * self.factor)

@@ -239,11 +239,6 @@ class TrajectoryLayout(Layout):
         return self.state_dim + self.channels[1].size
 
     @property
-    def num_state_entries(self) -> int:
-        """n(T+1): the first entries of tau are states, the rest are inputs."""
-        return self.channels[0].size
-
-    @property
     def initial_state(self) -> slice:
         """Where x(0) lies in tau."""
         return slice(0, self.state_dim)
