@@ -14,10 +14,10 @@ from dadiff.denoisers import Gaussian as GaussianRecipe
 from dadiff.diffusion.conditional import Conditional
 from dadiff.diffusion.enforcement import CleanEstimate, Enforcement, Never, Normalised, PostHoc
 from dadiff.diffusion.estimate import Estimate
-from dadiff.diffusion.rivals import DPS
+from dadiff.diffusion.rivals import DPS, Selected
 from dadiff.diffusion.samplers import DDIM, DDPM, DPMSolver, Sampler
 from dadiff.diffusion.schedule import Schedule, paper_linear
-from dadiff.errors import NotApplicableError
+from dadiff.errors import ConfigError, NotApplicableError
 from dadiff.exact import Gaussian, conditional_law, exactness, law_of_plans, sampled_exactness, wasserstein
 from dadiff.experts.lqr import GaussianLaw
 from dadiff.planning import Planner
@@ -133,6 +133,11 @@ def test_draws_give_the_closed_form_up_to_their_noise():
 def test_a_chain_that_is_not_affine_is_refused():
     with pytest.raises(NotApplicableError, match="a step of the chain is not affine"):
         exactness(planner(DPS()), CASES.environment)
+
+
+def test_what_selects_among_plans_is_refused_in_a_line():
+    with pytest.raises(ConfigError, match="depends on all plans"):
+        exactness(planner(Selected()), CASES.environment)
 
 
 def test_a_trained_denoiser_has_no_law():

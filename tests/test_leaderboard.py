@@ -74,3 +74,22 @@ def test_the_reports_of_methods_are_definitions(name):
     definition = load(name)
     assert definition.tables
     assert all(item.collect for item in (*definition.figures, *definition.tables))
+
+
+def test_a_counterpart_stands_beside_its_method_and_nowhere_else(evidence):
+    exact = {"denoiser": "gaussian"}
+    beside = {"metrics": ["rollout_state_error", "no_such"], "of": exact, "cells": {"projector": ["known", "hankel"]}}
+    table = tables.collect(evidence, cells={"denoiser": "mlp"}, metrics=[METRIC], beside=beside)
+    assert table.metrics == [METRIC, "rollout_state_error"]
+    (other,) = tables.collect(evidence, cells=exact | {"projector": "known"}, metrics=["rollout_state_error"]).rows
+    shown = {row.label: row.values["rollout_state_error"] for row in table.rows if row.values["rollout_state_error"]}
+    assert list(shown.values()) == list(other.values.values())  # the same enforcement's alone
+    assert list(shown) == [
+        row.label for row in table.rows if row.label.startswith("known") and "every step" in row.label
+    ]
+
+
+def test_claims_are_about_the_cells_that_a_report_judges(evidence):
+    assert evidence.of({}) is evidence
+    found = evidence.of({"denoiser": {"not": "gaussian"}}).all_methods
+    assert [m.axes for m in found] == [m.axes for m in evidence.all_methods if m.axes["denoiser"] != "gaussian"]

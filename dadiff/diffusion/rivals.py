@@ -69,7 +69,16 @@ class Selected(ProjectedSamples):
         return projected
 
     def end(self, tau: Array, at: Context) -> Array:
-        """The selected plans: those for one E follow one another."""
+        """The selected plans: those for one E follow one another.
+
+        Raises:
+            ConfigError: outside of a chain, where nothing was moved yet: what is selected depends on all plans.
+        """
+        if "moved" not in at.memory:
+            raise ConfigError(
+                "enforcement=dpcc_selected: what it selects depends on all plans, so that one has no law; "
+                "evaluation=exact judges enforcement=dpcc, which selects none"
+            )
         moved, chosen = at.memory["moved"], 0 * tau
         for first, last in _alike(at.environment):
             least = moved[..., first:last].argmin(-1)[..., None, None]

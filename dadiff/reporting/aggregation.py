@@ -12,7 +12,7 @@ import math
 import re
 from collections import defaultdict
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -29,7 +29,7 @@ PRESETS = ("_fixed", "_unchecked")  # what they set is an axis of its own
 ALIASES = ("projector.initial_state",)  # stored as `initial_state`, too
 FIRST = (
     *("task", "projector", "projector.features", "enforcement", "enforcement.spread", "initial_state"),
-    *("recording.length", "system.process_noise", "denoiser"),
+    *("recording.length", "system.process_noise", "denoiser", "training", "training.projects"),
 )
 LEVELS = ("robot", "case", "sample", "t")
 
@@ -165,6 +165,11 @@ class Evidence:
     def methods(self, cells: Selector) -> list[Method]:
         """Methods that a selector asks for, whatever became of them."""
         return [method for method in self.all_methods if matches(method.axes, cells)]
+
+    def of(self, cells: Selector) -> Evidence:
+        """What some cells say; all if none are selected."""
+        chosen = [cell for cell in self.sweep.cells if matches(cell.axes, cells)]
+        return Evidence(replace(self.sweep, cells=chosen)) if cells else self
 
     def partner(self, method: Method, against: Selector) -> Method | None:
         """What a method is compared to: the method that `against` asks for, alike in all else that applies.

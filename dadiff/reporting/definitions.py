@@ -89,13 +89,18 @@ def _own_figure(kind: str, item: str) -> Callable[..., Any]:
 
 @dataclass(frozen=True)
 class Definition:
-    """One report."""
+    """One report.
+
+    Args:
+        judged: selects the cells that claims are about; empty for all.
+    """
 
     name: str
     title: str
     about: str = ""
     sweeps: list[str] = field(default_factory=list)
     claims: list[str] | None = None
+    judged: dict[str, Any] = field(default_factory=dict)
     figures: list[Item] = field(default_factory=list)
     tables: list[Item] = field(default_factory=list)
 

@@ -80,7 +80,7 @@ def build(definition: Definition, evidence: Evidence, ledger: list[Claim], comma
         definition,
         evidence,
         command,
-        [judge(claim, evidence) for claim in asked],
+        [judge(claim, evidence.of(definition.judged)) for claim in asked],
         [_part(item, evidence) for item in definition.figures],
         [_part(item, evidence) for item in definition.tables],
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -12,7 +12,7 @@ from dadiff.outside import spreadsheet_safe
 from dadiff.reporting.aggregation import LEVELS, Evidence, Method, has_metric, pair, varying
 from dadiff.reporting.labels import FLOORS, METRICS, method_name
 from dadiff.reporting.leaderboard import Place, at_their_best, places
-from dadiff.reporting.selection import Selector
+from dadiff.reporting.selection import Selector, matches
 from dadiff.reporting.statistics import Estimate, difference, mean, ratio
 from dadiff.store.record import ABOUT_DATA, is_odd
 
@@ -66,6 +66,7 @@ def collect(
     group: str | None = None,
     ranked_by: str | None = None,
     tuned: Sequence[str] = (),
+    beside: Mapping[str, Any] | None = None,
 ) -> Table:
     """The methods that `cells` asks for; metrics that none of them has are left out, those about data from files stand
     in every table.
@@ -76,6 +77,8 @@ def collect(
         group: of a fleet, the robots of this group alone.
         ranked_by: a metric, the less the better, by which methods have a `rank` and `wins`, and rows their order.
         tuned: axes of which the best value by that metric is taken and named.
+        beside: `metrics` of what the methods that `cells` asks for are alike to in all but the axes of `of`, in columns
+            at the end: what each would be with another denoiser, say.
     """
     methods = evidence.methods(cells)
     if ranked_by and tuned:
@@ -85,9 +88,26 @@ def collect(
     wanted = dict.fromkeys([*metrics, *ABOUT_DATA])
     kept = [name for name in wanted if any(m.finished and has_metric(m.finished, name) for m in methods)]
     rows = [_row(evidence, method, kept, shown, relative_to, group) for method in methods]
+    if beside:
+        kept, rows = _beside(evidence, methods, kept, rows, **beside)
     if ranked_by:
         kept, rows = _ranked(evidence, methods, kept, rows, ranked_by, relative_to)
     return Table(kept, method_name(dict(relative_to), relative_to) if relative_to else "", rows, _odd(methods))
+
+
+def _beside(
+    evidence: Evidence, methods: list[Method], kept: list[str], rows: list[Row], *, metrics: list[str], of: Selector,
+    cells: Selector,
+) -> tuple[list[str], list[Row]]:  # fmt: skip
+    """The metrics and rows with those of each method's counterpart, which is asked for by `of`."""
+    asked = [method if method.finished and matches(method.axes, cells) else None for method in methods]
+    others = [None if method is None else evidence.partner(method, of) for method in asked]
+    found = [_row(evidence, other, metrics, [], None, None).values if other else {} for other in others]
+    added = [name for name in metrics if any(values.get(name) for values in found)]
+    return [*kept, *added], [
+        replace(row, values=row.values | {name: values.get(name) for name in added})
+        for row, values in zip(rows, found, strict=True)
+    ]
 
 
 def _ranked(
