@@ -2,7 +2,8 @@
 
     python -m bench [--out FOLDER] [part ...]
 
-Prints a table, and writes it with the figure to `bench.json`, `bench.md` and `bench.svg` in the folder (outputs).
+Prints a table, and writes it with the figure to `bench.json`, `bench.md` and `bench.svg` in the folder (outputs). With
+`--out docs` they are the ones that the documentation shows, and what it says of them is written anew, too.
 `nonlinear` and `projections` are parts of their own, which only print what they find.
 """
 
@@ -22,6 +23,7 @@ from bench.machine import described
 from bench.rows import Row
 from bench.show import draw, markdown, table
 from dadiff import threads
+from dadiff.reporting.publishing import fill_documents
 
 PARTS = {  # part: threads; None leaves them to torch
     "learning": None,
@@ -34,6 +36,8 @@ PARTS = {  # part: threads; None leaves them to torch
 }
 PRINTING = ("nonlinear", "projections")
 """One thread; a minute or more each."""
+
+DOCS = Path(__file__).absolute().parent.parent / "docs"
 
 
 def main() -> None:
@@ -64,6 +68,8 @@ def measure(parts: Sequence[str], folder: Path) -> None:
     (folder / "bench.json").write_text(json.dumps({"machine": machine, "rows": shown}, indent=1) + "\n")
     (folder / "bench.md").write_text(markdown(rows, machine))
     draw(rows, folder / "bench.svg")
+    if folder.absolute() == DOCS:
+        fill_documents(DOCS.parent / "reports" / "published")
     print(f"{table(rows)}\n{machine}\nwritten to {folder}: bench.json, bench.md, bench.svg")
 
 

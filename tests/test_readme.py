@@ -105,15 +105,15 @@ def test_what_documents_say_of_published_reports_is_what_these_say():
     for path in DOCUMENTS:
         assert path.read_text() == publishing.fill(path, root, claims)
     assert all(
-        kind in "".join(TEXTS.values())
-        for kind in ("<!-- figure: ", "<!-- sentences: ", "<!-- ledger: short", "<!-- ledger: all")
+        f"<!-- {kind}" in "".join(TEXTS.values())
+        for kind in ("figure: ", "sentences: ", "ledger: short", "ledger: all", "bench: beside", "bench: alone")
     )
 
 
 def test_a_block_of_unknown_kind_is_named(tmp_path):
     document = tmp_path / "README.md"
     document.write_text("<!-- table: all -->\n<!-- end -->\n")
-    with pytest.raises(ConfigError, match="unknown kind 'table'; expected figure, sentences, ledger"):
+    with pytest.raises(ConfigError, match="unknown kind 'table'; expected figure, sentences, ledger, bench"):
         publishing.fill(document, tmp_path / "reports" / "published", [])
 
 

@@ -1,4 +1,4 @@
-"""Writes what is made from the published reports: their pages, the index of all, and parts of the README and of docs/.
+"""Writes what is made from published reports and the kept bench: pages, their index, parts of the README and of docs/.
 
     python -m dadiff.reporting.publishing reports/published
 
@@ -8,15 +8,19 @@ Parts of documents stand between marks that name them:
     <!-- sentences: paper_lqr -->  what a published report found, in its three sentences
     <!-- ledger: short -->         one verdict a claim, of the claims that have a short name
     <!-- ledger: all -->           the same of all claims, with exceptions and effects in full
+    <!-- bench: beside -->         how long one plan takes beside what else plans, from docs/bench.json
+    <!-- bench: alone -->          what the same bench found that is compared with nothing
     <!-- end -->
 """
 
 from __future__ import annotations
 
+import json
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 from dadiff.errors import ConfigError
 from dadiff.reporting import published, story
@@ -33,10 +37,17 @@ def write_pages(root: Path) -> list[Path]:
     claims = read_ledger(FOLDER / "claims.yaml")
     pages = {folder / "README.md": published.page(folder, claims) for folder in published.folders(root)}
     pages[root / "README.md"] = published.index(root, claims)
-    pages |= {path: fill(path, root, claims) for path in documents(root)}
     for path, text in pages.items():
         path.write_text(text, "utf-8")
-    return list(pages)
+    return [*pages, *fill_documents(root)]
+
+
+def fill_documents(root: Path) -> list[Path]:
+    """Write the README and the docs anew, with their blocks as `fill` makes them."""
+    claims, found = read_ledger(FOLDER / "claims.yaml"), documents(root)
+    for path in found:
+        path.write_text(fill(path, root, claims), "utf-8")
+    return found
 
 
 def fill(document: Path, root: Path, claims: list[Claim]) -> str:
@@ -91,6 +102,19 @@ def _ledger(which: str, root: Path, claims: list[Claim], prefix: str) -> str:
     return published.markdown(["claim", "verdict", "effect", "report"], rows)
 
 
+def _bench(which: str, root: Path, claims: list[Claim], prefix: str) -> str:
+    rows = json.loads((root.absolute().parent.parent / "docs" / "bench.json").read_text("utf-8"))["rows"]
+    if which == "alone":
+        return published.markdown(["what", "takes"], [[r["name"], _amount(r)] for r in rows if r["other"] is None])
+    plans = [row for row in rows if row["name"].startswith("one plan") and "processor time" in row["name"]]
+    told = [[r["name"].replace(", processor time", ""), f"{1 / r['ratio']:.2g}", r["against"]] for r in plans]
+    return published.markdown(["a planner", "times as long as", ""], told)
+
+
+def _amount(row: Mapping[str, Any]) -> str:
+    return f"{row['value']:.3g} {row['unit']}"
+
+
 def _link(name: str, prefix: str) -> str:
     return f"[`{name}`]({prefix}/{name}/README.md)"
 
@@ -116,6 +140,7 @@ KINDS: dict[str, Callable[[str, Path, list[Claim], str], str]] = {
     "figure": _figure,
     "sentences": _sentences,
     "ledger": _ledger,
+    "bench": _bench,
 }
 
 
