@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from math import sqrt
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from dadiff.denoisers.exact import ExactDenoiser
 from dadiff.diffusion.chain import Samples, sample
 from dadiff.diffusion.conditional import Conditional
 from dadiff.diffusion.context import Context, Counted, unprojected
-from dadiff.diffusion.enforcement import CleanEstimate, Convex, Literally, Never, Normalised, PostHoc
+from dadiff.diffusion.enforcement import CleanEstimate, Convex, Literally, Never, Normalised, PostHoc, Repeated
 from dadiff.diffusion.limiting import Barrier, QPFilter
 from dadiff.diffusion.measured import Measured
 from dadiff.diffusion.rivals import DPS, MCG, PPR, TMPD, PiGDM, Replacement, RolloutBlend, Selected
@@ -225,3 +226,13 @@ def test_a_stable_enforcement_never_diverges_where_vanilla_does_not():
     for enforcement in STABLE.values():
         for sampler in (DDPM(), DDIM(20)):
             assert draw(enforcement, projection(), sampler, paper_linear(), divergence_bound=100).diverged_at is None
+
+
+@pytest.mark.parametrize("times", [1, 2, 5])
+def test_plans_are_projected_as_often_as_is_asked_for(times):
+    """Each time from what the last time gave."""
+
+    def half(tau, metric=None, start=None, noise=None):
+        return (tau if start is None else start) / 2
+
+    assert Repeated(times).end(1.0, SimpleNamespace(project=half)) == 0.5**times

@@ -88,6 +88,13 @@ def test_the_barrier_moves_samples_as_little_as_its_quadratic_program(tube, rate
         np.testing.assert_allclose(one, y.value, atol=1e-6)
 
 
+def test_what_is_pinned_between_equal_bounds_is_left_there():
+    """Without a tube an interval of no width has 0 / 0 of its width left."""
+    project = Limited(Dynamics(LAYOUT, stages()), Bounds(0.3, 0.3)).bind(WHERE)
+    found = Barrier(tube=0.0).sample(draws(3), context(project)).numpy()
+    np.testing.assert_allclose(LAYOUT.inputs(WHERE.to_physical(found)), 0.3, rtol=1e-12)
+
+
 def test_a_chain_that_begins_within_the_tube_ends_within_bounds():
     bounded = np.isfinite(projection().box[1])
     inputs, states = LAYOUT.split(chain(Barrier(tube=10.0), projection()))[::-1]

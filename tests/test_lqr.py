@@ -19,6 +19,7 @@ from dadiff.randomness import numpy_generator
 from dadiff.systems import AffineSystem, Bounds, DampedIntegrators, Linear, TimeVarying, double_integrator
 from dadiff.tasks import LQR, Fleet
 from dadiff.tasks.obstacles import Obstacles
+from dadiff.tasks.quadratic import check_weight
 
 
 def task_for(system: Linear, horizon: int = 12, **options) -> LQR:
@@ -404,3 +405,12 @@ def test_a_data_set_begins_along_trajectories_where_it_is_asked_to():
         made[1].train(Obstacles(), double_integrator(process_noise=0.0))
     with pytest.raises(NotApplicableError, match="do not vary in time"):
         made[1].train(task_for(AFFINE["time-varying"]), AFFINE["time-varying"])
+
+
+@pytest.mark.parametrize("size", [1e-20, 1.0, 1e20])
+def test_whether_a_weight_is_positive_does_not_depend_on_its_size(size):
+    check_weight((size * np.diag([1.0, 1e-6])).tolist(), "weight", positive=True)
+    check_weight((size * np.diag([1.0, 0.0])).tolist(), "weight", positive=False)
+    for least, positive in ((-1e-6, False), (0.0, True)):
+        with pytest.raises(ConfigError, match="must be"):
+            check_weight((size * np.diag([1.0, least])).tolist(), "weight", positive=positive)

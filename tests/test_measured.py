@@ -116,3 +116,12 @@ def test_demonstrations_are_asked_about_evenly_and_must_be_many():
     with pytest.raises(ConfigError, match="takes at least 368 demonstrations of d = 184 numbers, and there are 300"):
         asked(300, 184)
     np.testing.assert_allclose(unexplained(np.ones((4, 2)), np.zeros((4, 0))), 1)
+
+
+def test_of_what_was_measured_all_directions_are_kept_or_as_many_as_are_asked_for():
+    C = np.diag(np.arange(1.0, LAYOUT.size + 1))
+    one = Measured(C, np.ones(LAYOUT.size), np.ones(LAYOUT.size), layout=LAYOUT, errors={"1": C})
+    np.testing.assert_allclose(one.at_step(1).matrix, C, atol=1e-12)
+    few = one.at_step(1, directions=2)
+    assert few.factor.shape == (LAYOUT.size, 2)
+    np.testing.assert_allclose(np.diag(few.matrix), np.diag(C))

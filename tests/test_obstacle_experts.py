@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from dadiff.errors import MissingExtraError
 from dadiff.experts.obstacles import batched, ipopt, successive
 from dadiff.experts.obstacles.problem import ObstacleProblem, Status
 from dadiff.experts.obstacles.quadratic import obstacle_free
-from dadiff.experts.obstacles.starts import best_of_starts, many_starts
+from dadiff.experts.obstacles.starts import best_of_starts, many_starts, other_side
 from dadiff.tasks.obstacles import Obstacles
 
 
@@ -76,3 +77,9 @@ def test_batched_is_nearly_always_as_good_as_ipopt_from_several_starts(distribut
     found, reference = batched.solve(problem), ipopt.solve(problem)
     assert found.solved.all()
     assert (found.cost <= 1.01 * reference.cost).mean() >= share
+
+
+def test_without_a_disc_to_pass_the_start_is_the_obstacle_free_optimum() -> None:
+    problem = off_centre_disc()
+    heavy, none = replace(problem, weight=3 * problem.weight), np.zeros((1, 1), dtype=bool)
+    np.testing.assert_allclose(other_side(heavy, obstacle_free(heavy), none, none), obstacle_free(heavy))

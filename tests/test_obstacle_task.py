@@ -62,6 +62,36 @@ def test_the_late_waypoint_lies_in_the_annulus_and_the_early_one_on_the_drift() 
     assert np.abs(e.waypoint[:, 0] - e.x_init[:, :2] - 0.5 * e.x_init[:, 2:]).max() <= 0.75
 
 
+def test_a_waypoint_due_half_way_is_a_late_one() -> None:
+    e, _ = (
+        Obstacles(horizon=20, waypoint_times=[10], max_waypoints=1)
+        .distribution_for(0.1)
+        .sample(100, np.random.default_rng(2))
+    )
+    distance = np.linalg.norm(e.waypoint[:, 0] - e.target, axis=1)
+    assert (distance.min() >= 0.5) & (distance.max() <= 2)
+
+
+def test_discs_on_the_way_lie_beside_it_between_two_steps_after_the_early_and_before_the_late_waypoint() -> None:
+    given = replace(Obstacles().distribution_for(0.1), near=1.0)
+    path = np.random.default_rng(0).standard_normal((2000, 41, 2)).cumsum(axis=1)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("dadiff.tasks.obstacle_distribution._ASIDE", 0.0)
+        centre = given._centres(path, np.random.default_rng(1))
+    distance = np.linalg.norm(path - centre[:, None], axis=-1)
+    assert distance.min(axis=1).max() == 0
+    assert set(distance.argmin(axis=1)) == set(range(5 + 2, 33 - 2 + 1))
+    aside = given._centres(path, np.random.default_rng(1)) - centre
+    along = np.stack([path[k, t + 1] - path[k, t - 1] for k, t in enumerate(distance.argmin(axis=1))])
+    np.testing.assert_allclose((aside * along).sum(axis=1), 0, atol=1e-12)
+    assert np.linalg.norm(aside, axis=1).std() == pytest.approx(0.35 * np.sqrt(1 - 2 / np.pi), rel=0.1)
+
+
+def test_what_is_not_redrawn_is_not_counted() -> None:
+    _, notes = Obstacles(max_obstacles=0).distribution_for(0.1).sample(50, np.random.default_rng(0))
+    assert notes == {"environments_redrawn": 0, "centres_redrawn_mean": 0}
+
+
 @pytest.mark.parametrize(
     "settings",
     [

@@ -153,3 +153,24 @@ def test_a_family_whose_offsets_differ_has_no_known_one():
         IdentifiedFamily(offset="known").fit(plant.layout(HORIZON), plant, *data(plant, 0.0))
     with pytest.raises(ConfigError, match="needs a system, and none is given"):
         IdentifiedFamily(offset="known").fit(plant.layout(HORIZON), None, *data(plant, 0.0))
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1e6])
+def test_units_do_not_decide_the_rank_of_a_hull(unit):
+    """With states and inputs in another unit, their offset and sizes change alike."""
+    plant = affine(PLANTS["one"])
+    layout, recording = plant.layout(HORIZON), exciting(60).record(plant)
+    usual = Hull.of(recording, layout, "estimated", None)
+    other = replace(recording, states=unit * recording.states, inputs=unit * recording.inputs)
+    found = Hull.of(other, layout, "estimated", None)
+    assert found.rank == usual.rank == layout.rank
+    np.testing.assert_allclose(found.sizes, usual.sizes, rtol=1e-6, atol=1e-9 * usual.sizes.max())
+
+
+def test_a_hull_that_knows_of_no_offset_lies_about_0():
+    """Whether it is told of none, or of no system that could have one."""
+    plant = affine(PLANTS["one"])
+    layout, recording = plant.layout(HORIZON), exciting(60).record(plant)
+    assert Hull.of(recording, layout, "none", plant).origin is None
+    assert Hull.of(recording, layout, "known", None).origin is None
+    assert np.abs(Hull.of(recording, layout, "known", plant).origin).max() > 0

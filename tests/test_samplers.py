@@ -167,6 +167,12 @@ def test_no_step_is_visited_twice(L, count, spacing):
 
 
 @every_schedule
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_few_calls_are_as_many_as_are_asked_for(schedule, count):
+    assert len(visited(schedule, count, "log_snr")) == count + 1
+
+
+@every_schedule
 @pytest.mark.parametrize("count", [3, 5, 10, 20])
 def test_steps_in_log_snr_go_from_the_mean_to_where_signal_begins_and_on_evenly(schedule, count):
     first, *inner, last = visited(schedule, count, "log_snr")

@@ -51,3 +51,8 @@ def test_the_distance_is_that_of_the_projectors(rng):
     np.testing.assert_allclose(projector_distance(U, V), expected, rtol=1e-12)
     assert projector_distance(U, U).max() < 1e-15
     np.testing.assert_allclose(projector_distance(np.eye(6)[:, :3], np.eye(6)[:, 3:]), 1)
+
+
+def test_orthogonal_images_are_a_right_angle_apart_whatever_rounding_does(rng):
+    bases = column_basis(rng.standard_normal((200, 6, 6)))
+    np.testing.assert_allclose(largest_angle(bases[..., :3], bases[..., 3:]), np.pi / 2)

@@ -15,6 +15,17 @@ SWAPS: dict[type, type] = {
     ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq, ast.And: ast.Or,
     ast.Or: ast.And,
 }  # fmt: skip
+OPPOSITES: dict[type, type] = {ast.Lt: ast.GtE, ast.LtE: ast.Gt, ast.Gt: ast.LtE, ast.GtE: ast.Lt}
+"""For comparisons with a real number or a named threshold, of which a tie is no case."""
+
+ROUNDING = 1e-5
+"""Real numbers below it are what rounding is allowed, and may as well be twice that."""
+
+SHAPES = ("reshape", "_like")
+"""Calls of which shapes alone count: -2 says what -1 does, and an entry what any other does."""
+
+HARMLESS = ("optimize",)
+"""Keywords that say how something is computed, and not what."""
 
 
 @dataclass(frozen=True)
@@ -51,24 +62,45 @@ class Fault:
 
 
 def change(node: ast.AST) -> str | None:
-    """Change a node in place; returns what was done, None if there is nothing to change."""
+    """Change a node in place; returns what was done, None if there is nothing to change.
+
+    The sign of a whole number is left alone: it counts from an end, which in a matrix is either end; another is tried.
+    """
     if isinstance(node, (ast.BinOp, ast.BoolOp, ast.AugAssign)) and type(node.op) in SWAPS:
+        if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Mult | ast.Div) and _rounds(node.left, node.right):
+            return None
         before, node.op = type(node.op), SWAPS[type(node.op)]()
         return f"{before.__name__} -> {type(node.op).__name__}"
     if isinstance(node, ast.Compare) and type(node.ops[0]) in SWAPS:
-        before, node.ops[0] = type(node.ops[0]), SWAPS[type(node.ops[0])]()
+        swaps = SWAPS | OPPOSITES if _real(node.left) or _real(node.comparators[0]) else SWAPS
+        before, node.ops[0] = type(node.ops[0]), swaps[type(node.ops[0])]()
         return f"{before.__name__} -> {type(node.ops[0]).__name__}"
-    if isinstance(node, ast.Constant) and isinstance(node.value, (bool, int, float)):
+    if isinstance(node, ast.Constant) and isinstance(node.value, (bool, int, float)) and not _rounds(node):
         before = node.value
         node.value = (not before) if isinstance(before, bool) else before + 1 if isinstance(before, int) else 2 * before
         return f"{before} -> {node.value}" if node.value != before else None
     if isinstance(node, (ast.If, ast.IfExp)):
         node.test = ast.UnaryOp(ast.Not(), node.test)
         return "condition -> not"
-    if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub):
+    if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub) and not _whole(node.operand):
         node.op = ast.UAdd()
         return "minus -> plus"
     return None
+
+
+def _whole(node: ast.AST) -> bool:
+    return isinstance(node, ast.Constant) and isinstance(node.value, int)
+
+
+def _real(node: ast.AST) -> bool:
+    constants = (part.value for part in ast.walk(node) if isinstance(part, ast.Constant))
+    names = (part.id for part in ast.walk(node) if isinstance(part, ast.Name))
+    return any(isinstance(value, float) for value in constants) or any(map(str.isupper, names))
+
+
+def _rounds(*nodes: ast.AST) -> bool:
+    values = (node.value for node in nodes if isinstance(node, ast.Constant))
+    return any(isinstance(value, float) and 0 < abs(value) < ROUNDING for value in values)
 
 
 def faults(file: Path) -> Iterator[Fault]:
@@ -91,8 +123,10 @@ def _read(function: ast.FunctionDef) -> Iterator[tuple[ast.AST, range]]:
         node, lines = todo.pop()
         if isinstance(node, (ast.FunctionDef, ast.Raise, ast.JoinedStr)):
             continue  # a function within is visited as itself
-        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr == "reshape":
-            continue  # where -2 says what -1 does
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr.endswith(SHAPES):
+            continue
+        if isinstance(node, ast.keyword) and node.arg in HARMLESS:
+            continue
         yield node, lines
         skipped = {id(node.annotation)} if isinstance(node, ast.AnnAssign) else set()
         for part in ast.iter_child_nodes(node):

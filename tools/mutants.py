@@ -41,10 +41,11 @@ ENOUGH = 0.95
 LONGEST, BUDGET = 10.0, 20.0  # processor seconds of a test that is used, and of all tests for one mutant
 ROOMS = ("trajectory", "behaviours", "diffusion", "denoisers", "experts", "tasks")
 TESTS = """layout response hankel subspace covariance systems nonlinear features flat physics
-    behaviours limited limited_ilqr nearest limiting manifold family enforcement conditional rivals exact doubt
+    behaviours limited limited_ilqr nearest limiting manifold family offsets enforcement conditional measured
+    rivals rival_networks exact doubt
     samplers schedules silence theorem1 denoisers training encodings
     lqr fleet ilqr obstacle_solver obstacle_experts obstacle_files obstacle_task manoeuvre
-    evaluation control closed_loop planning datasets"""
+    evaluation control closed_loop planning datasets likeness"""
 REASONS = Path(__file__).with_suffix(".txt")
 KEPT = ROOT / ".pytest_cache" / "mutants"
 

@@ -184,7 +184,8 @@ class RecordingMLP:
 
     def __post_init__(self) -> None:
         _check_positive("mlp_recording", width=self.width, blocks=self.blocks, context=self.context)
-        _check_trainable(2 * self.blocks * self.width**2 + self.context, width=self.width, context=self.context)
+        weights = self.width * (2 * self.blocks * self.width + self.context)
+        _check_trainable(weights, width=self.width, context=self.context)
 
     def build(
         self, layout: TrajectoryLayout, condition: Layout, schedule: Schedule, generator: torch.Generator
