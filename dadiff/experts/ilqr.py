@@ -13,8 +13,9 @@ is tracked in W instead, and z is found in the same sweep (`dadiff.experts.ricca
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from types import EllipsisType
 
 import numpy as np
@@ -133,6 +134,10 @@ class Tracking:
         where, values = self.pins
         return np.abs(tau[..., where] - values).sum(-1)
 
+    def merit(self, tau: np.ndarray, penalty: np.ndarray) -> np.ndarray:
+        """The cost of plans, and what they pay for missing their pins, (*robots, plans)."""
+        return self.cost(tau) + penalty * self.violation(tau)
+
     def feasible(self, tau: np.ndarray) -> np.ndarray:
         """Which plans are trajectories of the system from x_init, up to rounding, (*robots, plans)."""
         x, u = self.layout.split(tau)
@@ -249,8 +254,9 @@ def _sweep(problem: Tracking, plans: _Plans, tolerance: float) -> _Plans:
     tau, damping = plans.tau, plans.damping
     step = gauss_newton(problem, tau, damping, plans.feasible)
     penalty = np.maximum(plans.penalty, 4 * np.abs(step.multipliers).max(axis=-1, initial=0.0))
-    before = np.where(plans.feasible, problem.cost(tau) + penalty * problem.violation(tau), np.inf)
-    tau, after, moved = _backtrack(problem, tau, step, before, penalty)
+    before = np.where(plans.feasible, problem.merit(tau, penalty), np.inf)
+    trial, merit = partial(follow, problem, tau, step), partial(problem.merit, penalty=penalty)
+    tau, after, moved = backtrack(trial, merit, tau, before, problem.floor, _BACKTRACKS)
     converged = plans.converged | (moved & (before - after <= tolerance * after + problem.floor))
     damping = np.where(moved, damping / 10 * (damping > _DAMPING), np.maximum(10 * damping, _DAMPING))
     return _Plans(tau, plans.feasible | moved, damping, penalty, plans.count + ~plans.converged, converged)
@@ -291,23 +297,40 @@ def _parameters(problem: Tracking, tau: np.ndarray) -> tuple[np.ndarray, np.ndar
     return np.hstack([columns, np.eye(d)[:, where]]), joint, np.concatenate([M0, tau[..., where] - values], axis=-1)
 
 
-def _backtrack(
-    problem: Tracking, tau: np.ndarray, step: Step, before: np.ndarray, penalty: np.ndarray
+def backtrack(
+    trial: Callable[[np.ndarray], np.ndarray],
+    merit: Callable[[np.ndarray], np.ndarray],
+    tau: np.ndarray,
+    before: np.ndarray,
+    floor: np.ndarray,
+    lengths: int,
+    ended: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The longest of a = 1, 1/2, ... whose plan is no worse: plans, their merit, and which plans moved."""
-    best, merit = tau, before
+    """The longest of a = 1, 1/2, ... whose plan is no worse: plans, their merit, and which plans moved.
+
+    Args:
+        trial: the plans (*robots, plans, d) after steps of the lengths a (*robots, plans).
+        merit: of plans, (*robots, plans).
+        tau, before: the plans that steps are taken from, and their merit.
+        floor: by what a merit may rise.
+        lengths: how many are tried.
+        ended: plans that stay.
+    """
+    best, least = tau, before
+    ended = np.zeros(before.shape, dtype=bool) if ended is None else ended
     moved, a = np.zeros(before.shape, dtype=bool), np.ones(before.shape)
-    slack = 1e-13 * np.where(np.isfinite(before), before, 0) + problem.floor
-    for _ in range(_BACKTRACKS):
-        trial = follow(problem, tau, step, a)
-        value = problem.cost(trial) + penalty * problem.violation(trial)
-        better = ~moved & np.isfinite(value) & (value <= before + slack)
-        best, merit = np.where(better[..., None], trial, best), np.where(better, value, merit)
+    slack = 1e-13 * np.where(np.isfinite(before), before, 0) + floor
+    for _ in range(lengths):
+        tried = trial(a)
+        with np.errstate(over="ignore", invalid="ignore"):
+            value = merit(tried)
+        better = ~ended & ~moved & np.isfinite(value) & (value <= before + slack)
+        best, least = np.where(better[..., None], tried, best), np.where(better, value, least)
         moved |= better
-        if moved.all():
+        if (moved | ended).all():
             break
         a = np.where(moved, a, a / 2)
-    return best, merit, moved
+    return best, least, moved
 
 
 def follow(problem: Tracking, tau: np.ndarray, step: Step, a: np.ndarray) -> np.ndarray:

@@ -11,12 +11,12 @@ so their bounds hold after every sweep; bounds on states, half-planes and pins o
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
 from dadiff.errors import ConfigError, ShapeError
-from dadiff.experts.ilqr import Metric, Solution
+from dadiff.experts.ilqr import Metric, Solution, backtrack
 from dadiff.experts.nearest import Limits, Nearest, nearest
 from dadiff.systems import System
 from dadiff.trajectory.layout import TrajectoryLayout
@@ -85,6 +85,10 @@ class LimitedTracking:
         """What plans lack to keep their limits, in sum, (*robots, plans)."""
         return self.limits.exceeded(self.layout, self.flat(tau)).reshape(tau.shape[:-1])
 
+    def merit(self, tau: np.ndarray, penalty: np.ndarray) -> np.ndarray:
+        """The cost of plans, and what they pay for exceeding limits, (*robots, plans)."""
+        return self.cost(tau) + penalty * self.exceeded(tau)
+
     def within(self, tau: np.ndarray) -> np.ndarray:
         """Which plans keep their limits, (*robots, plans)."""
         with np.errstate(invalid="ignore"):
@@ -110,16 +114,17 @@ def solve(
         Plans of the system; converged are those that keep their limits and cannot be improved.
     """
     tau = np.array(problem.reference if start is None else start)
-    merit, ended = np.full(tau.shape[:-1], np.inf), np.zeros(tau.shape[:-1], dtype=bool)
+    least, ended = np.full(tau.shape[:-1], np.inf), np.zeros(tau.shape[:-1], dtype=bool)
     count, multiplier = np.zeros(tau.shape[:-1], dtype=int), None
     penalty = np.zeros(tau.shape[:-1])
     for _ in range(sweeps):
         step = linearised(problem, tau, multiplier)
         multiplier, penalty = step.multiplier, np.maximum(penalty, step.penalty)
-        before = np.where(np.isfinite(merit), problem.cost(tau) + penalty * problem.exceeded(tau), np.inf)
-        moved_to, merit, moved = _backtrack(problem, tau, step, before, penalty, ended)
+        before = np.where(np.isfinite(least), problem.merit(tau, penalty), np.inf)
+        trial, merit = partial(follow, problem, tau, step), partial(problem.merit, penalty=penalty)
+        tau, least, moved = backtrack(trial, merit, tau, before, problem.floor, _BACKTRACKS, ended)
         count += ~ended
-        tau, small = moved_to, before - merit <= tolerance * merit + problem.floor
+        small = before - least <= tolerance * least + problem.floor
         ended |= ~moved | small
         if ended.all():
             break
@@ -198,31 +203,6 @@ def _pull(layout: TrajectoryLayout, A: np.ndarray, B: np.ndarray, multiplier: np
     along = np.einsum("ktij,kti->ktj", A, multiplier)
     states = np.concatenate([along, zero], axis=1) - np.concatenate([zero, multiplier], axis=1)
     return layout.flatten(states, np.einsum("ktij,kti->ktj", B, multiplier))
-
-
-def _backtrack(
-    problem: LimitedTracking,
-    tau: np.ndarray,
-    step: LimitedStep,
-    before: np.ndarray,
-    penalty: np.ndarray,
-    ended: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The longest of a = 1, 1/2, ... whose plan is no worse: plans, their merit, and which plans moved."""
-    best, merit = tau, before
-    moved, a = np.zeros(before.shape, dtype=bool), np.ones(before.shape)
-    slack = 1e-13 * np.where(np.isfinite(before), before, 0) + problem.floor
-    for _ in range(_BACKTRACKS):
-        trial = follow(problem, tau, step, a)
-        with np.errstate(over="ignore", invalid="ignore"):
-            value = problem.cost(trial) + penalty * problem.exceeded(trial)
-        better = ~ended & ~moved & np.isfinite(value) & (value <= before + slack)
-        best, merit = np.where(better[..., None], trial, best), np.where(better, value, merit)
-        moved |= better
-        if (moved | ended).all():
-            break
-        a = np.where(moved, a, a / 2)
-    return best, merit, moved
 
 
 def follow(problem: LimitedTracking, tau: np.ndarray, step: LimitedStep, a: np.ndarray) -> np.ndarray:
