@@ -132,6 +132,8 @@ def test_the_expert_begins_where_it_is_told_and_may_be_wrong_about_the_robot(tas
     near = cases.reference + 1e-3 * rng.standard_normal(cases.reference.shape)
     found = task.solve(robots, cases.environment, start=near)
     np.testing.assert_allclose(found, cases.reference, atol=1e-4)
+    once, thrice = (task.solve(robots, cases.environment, start=near, sweeps=k) - cases.reference for k in (1, 3))
+    assert np.abs(thrice).max() < np.abs(once).max()
     nominal = Nominal("fixed").fit(robots.layout(task.horizon), robots)
     model = model_of(nominal)
     np.testing.assert_array_equal(model.parameter_table, np.broadcast_to([1.0, 1.2, 0.5], (5, 3)))
@@ -147,11 +149,12 @@ ROUGH += ["projector.angles=[2]", "projector.ridge=0.01", "projector.initial_sta
 
 @pytest.mark.parametrize("overrides", [[], ["projector=nominal"], ["projector=identified", *ROUGH]])
 def test_a_run_closes_the_loop_with_whatever_robot_the_planner_believes_in(overrides, tmp_path):
-    controllers = "evaluation.controllers=[receding,tracking,modelled,optimal]"
+    controllers = "evaluation.controllers=[receding,tracking,modelled,realtime,optimal]"
     delayed = ["evaluation.delay=1"] if not overrides else []
     configuration = composed(*TINY, *LOOP, controllers, *delayed, *overrides, f"output_dir={tmp_path}")
     metrics = execute(Experiment.of(configuration)).record.metrics
     assert metrics["closed_loop_optimal_5"] == 1
+    assert metrics["closed_loop_same_realtime_5"] == pytest.approx(1, abs=0.05)
     for controller in ("receding", "tracking", "modelled"):
         assert np.isfinite(metrics[f"closed_loop_same_{controller}_5"])
     assert ("model_cost_ratio" in metrics) == bool(overrides)

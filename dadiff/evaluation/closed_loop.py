@@ -108,16 +108,18 @@ class Bench:
         """See `ClosedLoop.controllers`."""
         if kind == "cloned":
             return self._cloned()
-        if kind in ("optimal", "modelled"):
-            model = self.planner.system if kind == "optimal" else self.model
-            return RecedingHorizon(partial(self._optimal_plan, model), every)
+        if kind in ("optimal", "modelled", "realtime"):
+            model = self.model if kind == "modelled" else self.planner.system
+            return RecedingHorizon(partial(self._optimal_plan, model, 1 if kind == "realtime" else None), every)
         follow = self._tracked if kind == "tracking" else (lambda states, inputs: OpenLoop(inputs))
         return RecedingHorizon(self._planned(), every, follow)
 
-    def _optimal_plan(self, model: System, x: np.ndarray, start: Trajectories | None) -> Trajectories:
+    def _optimal_plan(
+        self, model: System, sweeps: int | None, x: np.ndarray, start: Trajectories | None
+    ) -> Trajectories:
         layout, system = self.planner.layout, self.planner.system
         begin = layout.flatten(*start) if start is not None and self.evaluation.warm_start else None
-        return layout.split(self.task.solve(system, self._from(x), model, begin))
+        return layout.split(self.task.solve(system, self._from(x), model, begin, None if begin is None else sweeps))
 
     def _cloned(self) -> Cloned:
         shown = self.demonstrations

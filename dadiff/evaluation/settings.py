@@ -12,7 +12,7 @@ from dadiff.errors import ConfigError, NotApplicableError
 from dadiff.systems import System, TimeVarying
 from dadiff.tasks.task import Steering, Task
 
-ControllerChoice = Literal["receding", "tracking", "optimal", "modelled", "cloned"]
+ControllerChoice = Literal["receding", "tracking", "optimal", "modelled", "realtime", "cloned"]
 
 
 @dataclass(frozen=True)
@@ -52,8 +52,9 @@ class ClosedLoop(Evaluation):
         disturbance: standard deviation of the disturbance per state and step; None is the system's process noise.
         controllers: `receding` follows its plan open loop between two plans, `tracking` with LQR gains about the
             plan; `optimal` is the expert planning at the same interval, and `modelled` the expert that takes the
-            planner's model for the robot: what the model costs, whoever plans with it. `cloned` plans nothing: its
-            inputs are regressed on the state and E from the demonstrations, at every step.
+            planner's model for the robot: what the model costs, whoever plans with it. `realtime` is `optimal` with one
+            sweep from its last plan each time, the first apart: real-time iteration (Diehl et al. 2005). `cloned` plans
+            nothing: its inputs are regressed on the state and E from the demonstrations, at every step.
         warm_start: begin the chain, and an expert that iterates, from the last plan, moved on.
         delay: steps by which inputs come late.
         rate: plans a second that the robot asks for; slower ones miss their deadline.

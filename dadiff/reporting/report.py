@@ -76,11 +76,12 @@ def build(definition: Definition, evidence: Evidence, ledger: list[Claim], comma
         command: what a person types to make the report again.
     """
     asked = [claim for claim in ledger if definition.claims is None or claim.id in definition.claims]
+    judged = evidence.of(definition.judged)
     return Report(
         definition,
         evidence,
         command,
-        [judge(claim, evidence.of(definition.judged)) for claim in asked],
+        [judge(claim, judged) for claim in asked],
         [_part(item, evidence) for item in definition.figures],
         [_part(item, evidence) for item in definition.tables],
     )

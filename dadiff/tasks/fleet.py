@@ -119,6 +119,7 @@ class Fleet(ManyRobots):
         environment: np.ndarray,
         model: AffineSystem | None = None,
         start: np.ndarray | None = None,
+        sweeps: int | None = None,
     ) -> np.ndarray:
         """Each robot's optimum tau (robots, ..., d) without process noise for E (robots, ..., c); see `LQR.solve`."""
         return self.lqr.solve(system, self._ends(system, environment), model)

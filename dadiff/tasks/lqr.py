@@ -198,12 +198,13 @@ class LQR:
         environment: np.ndarray,
         model: AffineSystem | None = None,
         start: np.ndarray | None = None,
+        sweeps: int | None = None,
     ) -> np.ndarray:
         """The optimum tau (*robots, ..., d) without process noise for [x_init; target] (*robots, ..., 2n).
 
         Args:
             model: what is taken for the system.
-            start: of no use to a closed form.
+            start, sweeps: of no use to a closed form.
         """
         cost, ends, model = self.cost(system), self.condition(system).unpack(environment), model or system
         if system.bounds.any:

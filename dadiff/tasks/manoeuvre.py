@@ -123,16 +123,22 @@ class Manoeuvre(ManyRobots):
         return scores_of(system, self.cost(system, rollout, target[..., None, :]) / optimal[..., None])
 
     def solve(
-        self, system: Robots, environment: np.ndarray, model: System | None = None, start: np.ndarray | None = None
+        self,
+        system: Robots,
+        environment: np.ndarray,
+        model: System | None = None,
+        start: np.ndarray | None = None,
+        sweeps: int | None = None,
     ) -> np.ndarray:
         """Each robot's optimum tau (robots, ..., d) for E (robots, ..., c).
 
         Args:
             model: what is taken for the robots, of as many; None is what they are.
             start: tau to begin from; None begins at rest at the target.
+            sweeps: at most; None until the optimum is reached.
         """
         ends = {name: self.condition(system).get(environment, name) for name in ("x_init", "target")}
-        return self.optimum(system, self._ends(system).pack(**ends), model, start).tau
+        return self.optimum(system, self._ends(system).pack(**ends), model, start, sweeps or _SWEEPS).tau
 
     def goal(self, system: Robots, environment: np.ndarray) -> np.ndarray:
         """At rest at the target, (robots, ..., n)."""
@@ -161,6 +167,7 @@ class Manoeuvre(ManyRobots):
         environment: np.ndarray,
         model: System | None = None,
         start: np.ndarray | None = None,
+        sweeps: int = _SWEEPS,
     ) -> Solution:
         """Each robot's optimum in environments [x_init; target] (robots, plans, c); see `solve` for the rest."""
         ends = self._ends(system).unpack(environment)
@@ -173,9 +180,9 @@ class Manoeuvre(ManyRobots):
             given = taken.take(some), metric, reference[some], ends["x_init"][some]
             begin = None if start is None else start[some]
             if system.bounds.any:
-                parts.append(limited_ilqr.solve(LimitedTracking.by_bounds(*given), begin, sweeps=_SWEEPS))
+                parts.append(limited_ilqr.solve(LimitedTracking.by_bounds(*given), begin, sweeps=sweeps))
             else:
-                parts.append(solve(Tracking(*given), begin, sweeps=_SWEEPS))
+                parts.append(solve(Tracking(*given), begin, sweeps=sweeps))
         return Solution(*(np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])))
 
     def _ends(self, system: System) -> Layout:

@@ -192,12 +192,14 @@ class Steering(Protocol):
         environment: np.ndarray,
         model: System | None = None,
         start: np.ndarray | None = None,
+        sweeps: int | None = None,
     ) -> np.ndarray:
         """The expert's tau (*robots, ..., d) without process noise for E (*robots, ..., c).
 
         Args:
             model: what the expert takes for the dynamics; None is the system.
             start: tau to begin from, for experts that iterate.
+            sweeps: at most, of these; None until they have converged.
         """
         ...
 

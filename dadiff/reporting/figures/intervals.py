@@ -93,7 +93,7 @@ def collect(
     lines: dict[str, list[Line]] = {}
     for method in methods:
         for controller, found in _costs(method).items():
-            if controller != "optimal":
+            if controller not in ("optimal", "realtime"):
                 line = _line(method, prefix + controller, found, method_name(method.axes, shown), group)
                 lines.setdefault(controller, []).append(line)
     first = methods[0] if methods else None
