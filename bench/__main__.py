@@ -4,7 +4,7 @@
 
 Prints a table, and writes it with the figure to `bench.json`, `bench.md` and `bench.svg` in the folder (outputs). With
 `--out docs` they are the ones that the documentation shows, and what it says of them is written anew, too.
-`nonlinear` and `projections` are parts of their own, which only print what they find.
+`nonlinear`, `projections` and `waiting` are parts of their own, which only print what they find.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ PARTS = {  # part: threads; None leaves them to torch
     "overhead": None,
     "reports": None,
 }
-PRINTING = ("nonlinear", "projections")
-"""One thread; a minute or more each."""
+PRINTING = ("nonlinear", "projections", "waiting")
+"""One thread, but that which asks how many; a minute or more each."""
 
 DOCS = Path(__file__).absolute().parent.parent / "docs"
 

@@ -12,22 +12,21 @@ import math
 import os
 from pathlib import Path
 
-SPINS = "2000"
+SPINNING, SPINS = "GOMP_SPINCOUNT", "2000"
 LIMITS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 CONTROL_GROUP = Path("/sys/fs/cgroup")
 
 
 def settle() -> None:
     """Set what this process's environment does not say already. To be called before torch is imported."""
-    os.environ.setdefault("GOMP_SPINCOUNT", SPINS)
+    os.environ.setdefault(SPINNING, SPINS)
     if cores() < affine_cores():  # torch knows nothing of a container's share
         os.environ.setdefault("OMP_NUM_THREADS", str(cores()))
 
 
 def limits(threads: int) -> dict[str, str]:
     """The environment of processes that shall take so many threads."""
-    waiting = os.environ.get("GOMP_SPINCOUNT", SPINS)
-    return {**dict.fromkeys(LIMITS, str(threads)), "GOMP_SPINCOUNT": waiting}
+    return {**dict.fromkeys(LIMITS, str(threads)), SPINNING: os.environ.get(SPINNING, SPINS)}
 
 
 def own() -> int:

@@ -67,6 +67,15 @@ def threads_and_times() -> None:
     os.write(1, f"{torch.get_num_threads()} {begun} {time.time()}".encode())
 
 
+def meeting(own: Path, other: Path) -> None:
+    import torch
+
+    own.touch()
+    while not other.exists():
+        time.sleep(0.01)
+    os.write(1, str(torch.get_num_threads()).encode())
+
+
 class Silent:
     def ended(self, work, outcome) -> None:
         pass
@@ -259,9 +268,9 @@ def test_the_last_line_of_a_log_is_its_progress(tmp_path):
     assert [clock(s) for s in (7.31, 245, 7800)] == ["7.3 s", "4:05", "2:10:00"]
 
 
-def test_work_that_is_alone_waits_for_the_rest_and_has_every_thread(tmp_path):
+def test_a_training_waits_for_the_rest_and_has_every_thread(tmp_path):
     crowd = [work(tmp_path, key, threads_and_times) for key in "ab"]
-    alone = replace(work(tmp_path, "c", threads_and_times), alone=True)
+    alone = replace(work(tmp_path, "c", threads_and_times), trains=True)
     after = [work(tmp_path, key, threads_and_times) for key in "de"]
     ProcessPool(workers=2, threads=1, preload=["torch"]).run([*crowd, alone, *after], Silent())
     seen = {key: (tmp_path / "logs" / f"{key}.log").read_text().split() for key in "abcde"}
@@ -269,6 +278,17 @@ def test_work_that_is_alone_waits_for_the_rest_and_has_every_thread(tmp_path):
     begun, ended = ({key: float(words[k]) for key, words in seen.items()} for k in (1, 2))
     assert max(ended["a"], ended["b"]) <= begun["c"]
     assert ended["c"] <= min(begun["d"], begun["e"])
+
+
+def test_trainings_with_a_thread_each_run_side_by_side(tmp_path):
+    """Each ends only once the other has begun."""
+    both = [
+        replace(work(tmp_path, one, meeting), trains=True, arguments=(tmp_path / one, tmp_path / other))
+        for one, other in ("ab", "ba")
+    ]
+    ends = ProcessPool(2, time_limit=120, preload=["torch"], training_threads=1).run(both, Silent())
+    assert [end.status for end in ends.values()] == ["finished", "finished"]
+    assert [(tmp_path / "logs" / f"{key}.log").read_text() for key in "ab"] == ["1", "1"]
 
 
 def test_a_server_that_was_killed_is_told_in_a_line(tmp_path, monkeypatch):

@@ -43,6 +43,7 @@ class ProcessPool(Pool[Process]):
 
     Args:
         workers: None for as many as the cores allow.
+        training_threads: of each training; None for those of all workers, so that it runs alone.
         time_limit: seconds that a job may take; None for no limit.
         preload: modules that the server imports before it forks.
 
@@ -51,11 +52,18 @@ class ProcessPool(Pool[Process]):
     """
 
     def __init__(
-        self, workers: int | None, threads: int = 1, time_limit: float | None = None, preload: Sequence[str] = ()
+        self,
+        workers: int | None,
+        threads: int = 1,
+        time_limit: float | None = None,
+        preload: Sequence[str] = (),
+        training_threads: int | None = None,
     ) -> None:
-        check_positive(threads=threads)
+        check_positive(threads=threads, training_threads=training_threads)
         threads = min(threads, max(1, cores() // (workers or 1)))
         super().__init__(cores() // threads if workers is None else workers, threads, time_limit)
+        self._all = self.workers * self.threads
+        self._training_threads = min(training_threads or self._all, self._all)
         self._context = multiprocessing.get_context("forkserver")
         self._context.set_forkserver_preload(list(preload))
         _start_server(threads)
@@ -68,12 +76,15 @@ class ProcessPool(Pool[Process]):
         return super().run(works, observer)
 
     def _has_room(self, work: Work, running: Sequence[Process]) -> bool:
-        crowded = running and (work.alone or any(entry.work.alone for entry in running))
-        return super()._has_room(work, running) and not crowded
+        return sum(map(self._claim, [work, *(entry.work for entry in running)])) <= self._all
+
+    def _claim(self, work: Work) -> int:
+        """How many threads of all workers it takes."""
+        return self._training_threads if work.trains else self.threads
 
     def _start(self, work: Work) -> Process:
         receive, send = self._context.Pipe(duplex=False)
-        threads = min(self.threads * self.workers, cores()) if work.alone else self.threads
+        threads = min(self._claim(work), cores())
         process = self._context.Process(target=_main, args=(work, threads, send), name=work.name)
         _fork(process)
         send.close()

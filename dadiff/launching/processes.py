@@ -19,8 +19,9 @@ class ProcessesLauncher(SweepLauncher):
     workers: int | None = None
     threads: int = 1
     time_limit: float | None = None
+    training_threads: int | None = None
     sweep: str | None = None
 
     def pool(self, run: SweepRun, lease: Lease) -> ProcessPool:
         """Its server starts at once, while the sweep is opened."""
-        return ProcessPool(self.workers, self.threads, self.time_limit, PRELOAD)
+        return ProcessPool(self.workers, self.threads, self.time_limit, PRELOAD, self.training_threads)

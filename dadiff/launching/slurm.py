@@ -33,7 +33,7 @@ class SlurmJob(Queued):
 
 
 class SlurmPool(Pool[SlurmJob]):
-    """`workers` Slurm jobs at a time, one a piece of work; `Work.alone` asks nothing of jobs that share no machine.
+    """`workers` Slurm jobs at a time, one a piece of work; `Work.trains` asks nothing of jobs that share no machine.
 
     Args:
         folder: where submitit keeps its files; all nodes see it.

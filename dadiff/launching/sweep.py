@@ -144,8 +144,8 @@ class SweepRun:
     def _preparation(self, preparation: Preparation) -> Work:
         artefact = preparation.artefact
         log_file = self.folder / "logs" / f"{artefact.kind}-{artefact.key}.log"
-        arguments, alone = (preparation.configs, artefact.kind), artefact.kind == "denoiser"
-        return Work(artefact.key, preparation.name, jobs.build, arguments, log_file, preparation.needs, alone)
+        arguments, trains = (preparation.configs, artefact.kind), artefact.kind == "denoiser"
+        return Work(artefact.key, preparation.name, jobs.build, arguments, log_file, preparation.needs, trains)
 
     def _run(self, cell: PlannedRun) -> Work:
         key = cell.identity.key

@@ -42,7 +42,7 @@ class Table:
         """Say for good how a piece of work ended."""
         self._ended["done" if outcome.status in DONE else "failed"] += 1
         self._clear()
-        if not work.alone:
+        if not work.trains:
             self._seconds.append(outcome.seconds)
         count = f"[{self._ended.total()}/{self._total}]"
         head = f"{count:>9} {outcome.status:<9} {clock(outcome.seconds):>7}  "
@@ -74,7 +74,7 @@ class Table:
         waiting = self._total - done - failed - len(running)
         parts = {"done": done, "skipped": self._skipped, "failed": failed, "running": len(running), "waiting": waiting}
         counts = ", ".join(f"{count} {what}" for what, count in parts.items() if count)
-        left = time_left(self._seconds, [entry.seconds for entry in running if not entry.work.alone], waiting)
+        left = time_left(self._seconds, [entry.seconds for entry in running if not entry.work.trains], waiting)
         ahead = "" if left is None else f", about {clock(left)} left"
         return f"--- {counts} --- {clock(time.monotonic() - self._started)}{ahead}"
 

@@ -29,7 +29,7 @@ class Work:
         function: importable by name, called with `arguments`.
         log_file: where its standard output and error go.
         needs: keys of the work that must have ended well before.
-        alone: it has the machine to itself, and the threads of all workers; so does a training.
+        trains: it gains from threads: it has those of all workers, and so the machine to itself, or what the pool says.
     """
 
     key: str
@@ -38,7 +38,7 @@ class Work:
     arguments: tuple[Any, ...]
     log_file: Path
     needs: frozenset[str] = frozenset()
-    alone: bool = False
+    trains: bool = False
 
 
 @dataclass
