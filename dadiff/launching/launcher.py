@@ -44,6 +44,9 @@ class SweepLauncher(Launcher):
     def pool(self, run: SweepRun, lease: Lease) -> Pool[Any]:
         """What runs the jobs of this start of a sweep, as long as the lease is held."""
 
+    def expect_work(self) -> None:
+        """Get ready meanwhile: the first cell is to be run, and the others are not composed yet."""
+
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
         """Called by Hydra before its sweeper launches."""
         self.config = config
@@ -61,7 +64,11 @@ class SweepLauncher(Launcher):
         return [JobReturn(overrides=list(cell), status=JobStatus.COMPLETED) for cell in job_overrides]
 
     def _launch(self, job_overrides: Sequence[Sequence[str]]) -> int:
-        plan = make_plan([self.composer.cell(cell) for cell in job_overrides])
+        configs = map(self.composer.cell, job_overrides)
+        first = next(configs)
+        if not first.get("dry_run") and make_plan([first]).waiting:
+            self.expect_work()
+        plan = make_plan([first, *configs])
         name = self._name()
         if plan.cells[0].config.get("dry_run"):
             sys.stdout.write(describe(plan) + "\n")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 from dadiff.launching.launcher import SweepLauncher
 from dadiff.launching.process_pool import ProcessPool
@@ -22,6 +23,14 @@ class ProcessesLauncher(SweepLauncher):
     training_threads: int | None = None
     sweep: str | None = None
 
+    def expect_work(self) -> None:
+        """The server that jobs are forked from loads while the rest of the sweep is composed."""
+        _ = self._pool
+
     def pool(self, run: SweepRun, lease: Lease) -> ProcessPool:
-        """Its server starts at once, while the sweep is opened."""
+        """The same for all starts."""
+        return self._pool
+
+    @cached_property
+    def _pool(self) -> ProcessPool:
         return ProcessPool(self.workers, self.threads, self.time_limit, PRELOAD, self.training_threads)
