@@ -49,6 +49,7 @@ WORDS: dict[str, dict[str, str]] = {
     "task": {"manoeuvre_pendulums": "pendulums", "manoeuvre_reachers": "reachers"},
     "projector.bounds": {"ignored": "bounds ignored", "enforced": "within bounds"},
     "projector.replay": {"True": "replayed", "False": ""},
+    "evaluation": {"default": "", "closed_loop": "in closed loop", "exact": "exact"},
     "training": {"penalised": "told of the dynamics"},
     "training.projects": {"True": "projected in its loss", "False": ""},
     "projector.features": {

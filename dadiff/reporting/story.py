@@ -195,14 +195,23 @@ def main_table(content: Mapping[str, Any]) -> tuple[str, Mapping[str, Any]] | No
 
 
 def main_columns(table: Mapping[str, Any]) -> list[tuple[str, bool]]:
-    """Four columns beside the method: the first metric, its ratio to the baseline, and the two that say most of use."""
+    """Four columns beside the method: the first metric, its ratio to a baseline, and those that say most of use."""
     first, *others = table["metrics"]
     told = sorted(others, key=lambda metric: OF_USE.index(metric) if metric in OF_USE else len(OF_USE))
-    ratio = [(first, True)] if table["baseline"] else []
+    compared = table["baseline"] and any(ratio_of(row, first) for row in table["rows"])
+    ratio = [(first, True)] if compared else []
     return [(first, False), *ratio, *((metric, False) for metric in told[: 3 - len(ratio)])]
 
 
-OF_USE = ("cost_ratio", "collision_rollout", "rollout_state_error", "gap", "dynamics_residual")
+OF_USE = (
+    "wins",
+    "cost_ratio",
+    "collision_rollout",
+    "exact_distance",
+    "rollout_state_error",
+    "gap",
+    "dynamics_residual",
+)
 
 
 def ratio_of(row: Mapping[str, Any], metric: str, part: str = "ratio") -> Estimate | None:
