@@ -30,6 +30,31 @@ def test_the_index_is_that_of_the_reports():
         assert f"[{folder.name}]({folder.name}/README.md)" in text
 
 
+def test_all_of_it_stays_small():
+    assert sum(path.stat().st_size for path in ROOT.rglob("*") if path.is_file()) < 8e6
+
+
+def test_what_is_published_says_what_the_report_says(fresh, tmp_path):
+    whole = published.read(fresh.parent.parent / "out")
+    found = published.read(fresh)
+    sizes = [(folder / "report.json").stat().st_size for folder in (fresh, fresh.parent.parent / "out")]
+    assert sizes[0] < 0.75 * sizes[1]
+    assert found["cells"][0].keys() == {"key", "status"}
+    assert published.page(fresh, CLAIMS) == published.page(_with_commands_of(whole, found, fresh, tmp_path), CLAIMS)
+    for here, there in zip(found["tables"].values(), whole["tables"].values(), strict=True):
+        rows = zip(here["content"]["rows"], there["content"]["rows"], strict=True)
+        assert all(row["runs"] == other["runs"] and row["label"] == other["label"] for row, other in rows)
+    lines, others = (story.ledger(content, CLAIMS) for content in (found, whole))
+    assert lines == others
+
+
+def _with_commands_of(whole: dict, found: dict, fresh: Path, folder: Path) -> Path:
+    """A folder with the unpacked report, and links to the figures."""
+    (folder / "report.json").write_text(json.dumps({**whole, "commands": found["commands"]}))
+    (folder / "figures").symlink_to(fresh / "figures")
+    return folder
+
+
 def test_figures_carry_their_own_panel():
     drawings = list(ROOT.glob("*/figures/*.svg"))
     assert drawings
@@ -89,7 +114,7 @@ def test_a_line_has_the_counts_and_effects_of_its_findings(fresh):
 
 
 def test_reports_of_the_older_format_are_judged_by_their_stored_intervals():
-    content = json.loads((ROOT / "hankel_length" / "report.json").read_text())
+    content = published.read(ROOT / "hankel_length")
     assert content["format"] == 1
     lines = {line.claim.id: line for line in story.ledger(content, CLAIMS)}
     assert lines["longer_recording"].verdict == "holds for 4 of 4"

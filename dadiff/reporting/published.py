@@ -14,6 +14,7 @@ from typing import Any
 
 from dadiff.errors import StoreError
 from dadiff.outside import json_of
+from dadiff.reporting import slim
 from dadiff.reporting.claims import Claim
 from dadiff.reporting.definitions import load, names
 from dadiff.reporting.labels import column_name, column_value
@@ -39,7 +40,7 @@ def read(folder: Path) -> dict[str, Any]:
         raise StoreError(f"{path}: is no report of dadiff, or damaged; write it again with dadiff-report")
     if content["format"] > FORMAT:
         raise StoreError(f"{path}: has format {content['format']}, this version reads up to {FORMAT}; update dadiff")
-    return content
+    return slim.unpacked(content)
 
 
 def folders(root: Path) -> list[Path]:

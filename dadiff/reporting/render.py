@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from dadiff.errors import StoreError
-from dadiff.reporting import configurations, published, publishing, slim, story
+from dadiff.reporting import configurations, drawings, published, publishing, slim, story
 from dadiff.reporting.claims import Verdict, read_ledger
 from dadiff.reporting.definitions import FOLDER
 from dadiff.reporting.latex import to_latex
@@ -41,17 +41,17 @@ def render(report: Report, folder: Path) -> Path:
     for part in FORMS:
         make_folder(folder / part)
     older = _parts_in(folder)
-    drawings = draw_all([part for part in report.figures if not part.empty])
+    drawn = draw_all([part for part in report.figures if not part.empty])
     try:
         _write_tables(report, folder / "tables")
-        for name, drawing in drawings.items():
+        for name, drawing in drawn.items():
             for form, content in drawing.files.items():
-                whole = slim.drawing(with_panel(untagged(content))) if form == "svg" else content
+                whole = drawings.smaller(with_panel(untagged(content))) if form == "svg" else content
                 (folder / "figures" / f"{name}.{form}").write_bytes(whole)
         shown = numbers(report)
         (folder / "report.json").write_text(slim.numbers(shown), "utf-8")
         (folder / "configurations.yaml").write_text(configurations.to_yaml(report.evidence.sweep), "utf-8")
-        (folder / "index.html").write_text(to_html(report, shown, drawings), "utf-8")
+        (folder / "index.html").write_text(to_html(report, shown, drawn), "utf-8")
         _remove(folder, older - _parts_in(folder))
     except OSError as error:
         raise StoreError(f"{folder}: cannot be written ({error.strerror}); choose another --out") from None
@@ -71,10 +71,13 @@ def publish(report: Path, folder: Path) -> None:
         for path in sorted(report.glob(part)):
             target = folder / path.relative_to(report)
             make_folder(target.parent)
-            shutil.copyfile(path, target)
+            if path.suffix == ".csv":
+                target.write_text(slim.table(path.read_text("utf-8")), "utf-8")
+            else:
+                shutil.copyfile(path, target)
     content = json.loads((folder / "report.json").read_text("utf-8"))
     content["commands"] = [PLACE.sub("", command) for command in content["commands"]]
-    (folder / "report.json").write_text(slim.numbers(content), "utf-8")
+    (folder / "report.json").write_text(slim.numbers(slim.packed(content)), "utf-8")
     _remove(folder, older - _parts_in(folder))
     if folder.absolute().parent.name == "published":
         publishing.write_pages(folder.absolute().parent)

@@ -118,10 +118,11 @@ def _identity(axes: Mapping[str, Any]) -> bool:
 
 
 def _estimate(value: Any) -> Estimate | None:
-    """nan is null in json."""
+    """Of a report or a published one; nan is null in json."""
     if value is None or isinstance(value, Estimate):
         return value
-    return Estimate(*(float("nan") if value[end] is None else value[end] for end in ("value", "low", "high")))
+    ends = value if isinstance(value, list) else [value[end] for end in ("value", "low", "high")]
+    return Estimate(*(float("nan") if end is None else end for end in ends))
 
 
 def unit(claim: Claim) -> str:
