@@ -14,6 +14,7 @@ from dadiff.denoisers import MLP, EncoderDecoder, Gaussian, InputsMLP, Recording
 from dadiff.denoisers.checkpoints import load, save, write
 from dadiff.denoisers.exact import ExactDenoiser, Smoother
 from dadiff.denoisers.learned import CHUNK, NetworkDenoiser
+from dadiff.denoisers.networks import step_features
 from dadiff.denoisers.prediction import loss_weights, prediction
 from dadiff.denoisers.recipes import Recipe
 from dadiff.diffusion.schedule import Schedule, cosine, ddpm_linear, paper_linear
@@ -383,3 +384,10 @@ def test_a_system_of_another_size():
     law = ClosedLoopLaw(system, optimal_feedback(system, np.eye(3), np.eye(2), 5))
     denoiser = Gaussian().exact(law, random_coordinates(), paper_linear())
     assert denoiser(draw(4, LAYOUT.size), 10, draw(6)).shape == (4, LAYOUT.size)
+
+
+def test_features_of_a_step_are_waves_of_lengths_from_2_pi_to_2_pi_10_000():
+    step = torch.tensor([1.0, 57.0, 1000.0])
+    wave = step[:, None] / np.geomspace(1, 1e4, 32)
+    expected = np.concatenate([np.sin(wave), np.cos(wave)], axis=-1)
+    np.testing.assert_allclose(step_features(step), expected, atol=1e-3)

@@ -165,6 +165,7 @@ def test_one_robot_of_one_input_keeps_clear_of_a_disc_on_curved_dynamics(rng):
     found = project(straight)
     states, inputs = layout.split(found)
     assert project.info.unconverged == 0
+    assert 2 <= project.info.iterations <= 2 * 20
     assert np.linalg.norm(states[0, :, :2] - disc[0, 0, :2], axis=-1).min() > 0.4
     assert np.abs(inputs).max() <= 2.0
     np.testing.assert_allclose(robot.simulate(np.zeros((1, 3)), inputs), states, atol=1e-12)

@@ -19,7 +19,7 @@ from dadiff.randomness import numpy_generator
 from dadiff.systems import AffineSystem, Bounds, DampedIntegrators, Linear, TimeVarying, double_integrator
 from dadiff.tasks import LQR, Fleet
 from dadiff.tasks.obstacles import Obstacles
-from dadiff.tasks.quadratic import check_weight
+from dadiff.tasks.quadratic import check_weight, stretched
 
 
 def task_for(system: Linear, horizon: int = 12, **options) -> LQR:
@@ -414,3 +414,8 @@ def test_whether_a_weight_is_positive_does_not_depend_on_its_size(size):
     for least, positive in ((-1e-6, False), (0.0, True)):
         with pytest.raises(ConfigError, match="must be"):
             check_weight((size * np.diag([1.0, least])).tolist(), "weight", positive=positive)
+
+
+def test_a_stretched_range_keeps_its_middle_and_times_its_width():
+    assert stretched(0.5, 3) == 1.5
+    assert stretched([0.5, [1.0, 4.0]], 3) == [1.5, [-2.0, 7.0]]
