@@ -1,5 +1,6 @@
 """Every command and every example of the README and of docs/ runs."""
 
+import csv
 import json
 import os
 import re
@@ -97,6 +98,39 @@ def test_own_components_run_as_written_from_an_empty_folder(tmp_path):
     refused = dadiff(["--config-dir", "myconf", "projector=damped"], tmp_path)
     assert refused.returncode == 1
     assert "components=[mylab]" in refused.stderr
+
+
+OWN_RIVAL = """
+from dataclasses import dataclass
+
+from dadiff.diffusion.enforcement import Never
+
+
+@dataclass(frozen=True)
+class Mine(Never):
+    def clean(self, tau0_hat, at):
+        return (tau0_hat + at.project(tau0_hat)) / 2
+"""
+
+
+@pytest.mark.slow
+def test_a_method_comes_onto_the_benches_as_contributing_says(tmp_path, monkeypatch, capsys):
+    for name, text in {"mylab/mine.py": OWN_RIVAL, "myconf/enforcement/mine.yaml": "_target_: mylab.mine.Mine"}.items():
+        (tmp_path / name).parent.mkdir(parents=True)
+        (tmp_path / name).write_text(text)
+    lines = [line.strip() for line in (ROOT / "CONTRIBUTING.md").read_text().splitlines()]
+    sweeps = [shlex.split(line)[1:] for line in lines if line.startswith("dadiff ") and "enforcement=mine" in line]
+    (report,) = (shlex.split(line)[1:] for line in lines if line.startswith("dadiff-report rivals_mine"))
+    few = [[], [f"task.{group}=2" for group in ("robots", "interpolation", "extrapolation")]]
+    for arguments, less in zip(sweeps, few, strict=True):
+        done = dadiff(["--config-dir", "myconf", *arguments, "components=[mylab]", *SMALL, *less], tmp_path)
+        assert done.returncode == 0, done.stderr
+    monkeypatch.chdir(tmp_path)
+    assert reporting.main(report) == 0, capsys.readouterr().err
+    (table,) = tmp_path.glob("outputs/reports/*/tables/by_cost.csv")
+    rows = list(csv.DictReader(table.read_text().splitlines()))
+    assert len(rows) == 2
+    assert all(float(row["exact_distance_mean"]) > 0 for row in rows)
 
 
 def test_what_documents_say_of_published_reports_is_what_these_say():
