@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import bench.__main__ as command
+from bench.learning import CONDITION, LAYOUT, products, shapes
 from bench.peers import ConvolutionNetwork, ancestral_chain
 from bench.rows import Row, least
 from bench.show import draw, markdown, slope, table
+from dadiff.denoisers import MLP
 from dadiff.diffusion.schedule import paper_linear
 from dadiff.trajectory import TrajectoryLayout
 
@@ -48,6 +51,30 @@ def test_the_published_table_is_that_of_the_published_numbers():
     told = json.loads((docs / "bench.json").read_text())
     rows = [Row(**{name: value for name, value in row.items() if name != "ratio"}) for row in told["rows"]]
     assert (docs / "bench.md").read_text() == markdown(rows, told["machine"])
+
+
+def test_what_is_kept_in_the_documents_is_told_there(tmp_path, monkeypatch):
+    docs, beside = tmp_path / "docs", replace(ROWS[0], name="one plan, mlp, processor time, 5 calls")
+    (tmp_path / "reports" / "published").mkdir(parents=True)
+    docs.mkdir()
+    (docs / "speed.md").write_text("<!-- bench: alone -->\n<!-- end -->\n<!-- bench: beside -->\n<!-- end -->\n")
+    monkeypatch.setattr(command, "DOCS", docs)
+    monkeypatch.setattr(command, "measured", lambda part: [*ROWS, beside])
+    command.measure(["learning"], docs)
+    told = (docs / "speed.md").read_text()
+    assert "| growing | 8 s |" in told
+    assert "| one plan, mlp, 5 calls | 0.33 | a slower one |" in told
+
+
+def test_a_steps_products_are_those_of_its_layers():
+    layers = shapes(MLP(width=16, blocks=1), batch=3)
+    assert layers[-3:] == [(3, 16, 16, True), (3, 16, 16, True), (3, 16, LAYOUT.size, True)]
+    assert {(K, asked) for _, K, _, asked in layers[:-3]} == {
+        (LAYOUT.size, False),
+        (64, False),
+        (CONDITION.size, False),
+    }
+    products(layers)()
 
 
 def test_least_takes_actions_in_turn():
