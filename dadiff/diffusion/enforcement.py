@@ -150,7 +150,10 @@ class Convex(Never):
 
 @dataclass(frozen=True)
 class CleanEstimate(Never):
-    """P on the clean estimate only. The sample lies in the set if the last step adds no noise."""
+    """P on the clean estimate only, the null-space step of DDNM (Wang, Yu & Zhang 2023).
+
+    The sample lies in the set if the last step adds no noise.
+    """
 
     def clean(self, tau0_hat: Array, at: Context) -> Array:
         """P(tau0_hat)."""
