@@ -319,6 +319,19 @@ def test_noise_leaves_a_gap_behind_the_rank_of_the_dynamics():
     assert gaps[1] > gaps[2]
 
 
+def test_noise_that_is_taken_for_dynamics_is_warned_of(caplog):
+    layout = double_integrator().layout(10)
+    HankelLowRank().fit(layout, recording=noisy(400, 1e-4))
+    assert not caplog.records
+    HankelLowRank().fit(layout, recording=noisy(minimum_length(layout) + 6, 1.0))
+    assert "noise is taken for dynamics" in caplog.text
+
+
+def test_what_is_rolled_out_has_the_freedom_of_its_inputs(system):
+    layout = system.layout(HORIZON)
+    assert fit(RolloutProjector(), system).notes["rank"] == layout.channel("u").size == HORIZON * system.input_dim
+
+
 LEARNED = {name: p for name, p in PROJECTORS.items() if "recording" in p.needs and not isinstance(p, Koopman)}
 FROM_HANKEL = {name: p for name, p in LEARNED.items() if isinstance(p, Hankel | HankelLowRank)}
 

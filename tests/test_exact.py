@@ -52,6 +52,14 @@ def planner(
     )  # fmt: skip
 
 
+def test_the_law_of_demonstrations_is_their_regression_on_E_and_what_that_leaves():
+    E = np.column_stack([np.ones(len(SHOWN.environment)), SHOWN.environment])
+    coefficients = np.linalg.lstsq(E, SHOWN.trajectories)[0]
+    left = SHOWN.trajectories - E @ coefficients
+    np.testing.assert_allclose(LAW.covariance, left.T @ left / (len(E) - E.shape[1]), atol=1e-12)
+    np.testing.assert_allclose(LAW.mean(E[:5, 1:]), E[:5] @ coefficients, atol=1e-10)
+
+
 def test_the_distance_of_gaussians_is_the_formula_of_givens_and_shortt():
     rng = np.random.default_rng(0)
     (a, b), (m, n) = (F @ F.T for F in rng.standard_normal((2, 5, 5))), rng.standard_normal((2, 5))

@@ -416,6 +416,14 @@ def test_whether_a_weight_is_positive_does_not_depend_on_its_size(size):
             check_weight((size * np.diag([1.0, least])).tolist(), "weight", positive=positive)
 
 
+def test_a_plan_of_one_step_is_a_plan(system):
+    task = task_for(system, horizon=1)
+    assert task.sample_environments(system, (3,), np.random.default_rng(0)).shape == (3, 2 * system.state_dim)
+    assert task.solve(system, np.zeros((1, 2 * system.state_dim))).shape == (1, system.layout(1).size)
+    with pytest.raises(ConfigError, match="horizon"):
+        task_for(system, horizon=0)
+
+
 def test_a_stretched_range_keeps_its_middle_and_times_its_width():
     assert stretched(0.5, 3) == 1.5
     assert stretched([0.5, [1.0, 4.0]], 3) == [1.5, [-2.0, 7.0]]
