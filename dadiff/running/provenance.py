@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+import shutil
 import subprocess
 import time
 from collections.abc import Mapping
@@ -64,12 +65,12 @@ def provenance(started: float, device: str | None = None) -> Provenance:
 
 @cache
 def commit() -> str | None:
-    """The git commit of the source, with `+changes` if files differ from it; None for an installed package.
+    """The git commit of the source, with `+changes` if files differ from it; None of a package, or without git.
 
     As it was when it was first asked for, which is nearer to what was loaded than what lies there later.
     """
     source = Path(__file__).parent.parent.parent
-    if not (source / ".git").exists():
+    if not (source / ".git").exists() or shutil.which("git") is None:
         return None
     git = ["git", "-C", str(source)]
     head = subprocess.run([*git, "rev-parse", "--short=12", "HEAD"], capture_output=True, text=True, check=False)
