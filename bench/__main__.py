@@ -4,7 +4,7 @@
 
 Prints a table, and writes it with the figure to `bench.json`, `bench.md` and `bench.svg` in the folder (outputs). With
 `--out docs` they are the ones that the documentation shows, and what it says of them is written anew, too.
-`nonlinear`, `projections` and `waiting` are parts of their own, which only print what they find.
+`projections` and `waiting` are parts of their own, which only print what they find.
 """
 
 from __future__ import annotations
@@ -31,10 +31,11 @@ PARTS = {  # part: threads; None leaves them to torch
     "optima": 1,
     "one_plan": 1,
     "projecting": 1,
+    "nonlinear": 1,
     "overhead": None,
     "reports": None,
 }
-PRINTING = ("nonlinear", "projections", "waiting")
+PRINTING = ("projections", "waiting")
 """One thread, but that which asks how many; a minute or more each."""
 
 DOCS = Path(__file__).absolute().parent.parent / "docs"
