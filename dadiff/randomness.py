@@ -8,6 +8,7 @@ Library code never touches global random state.
 from __future__ import annotations
 
 import zlib
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -33,5 +34,9 @@ def torch_generator(seed: int, role: str) -> torch.Generator:
     """As `numpy_generator`, for torch. It lives on the CPU, so that every device gets the same noise."""
     import torch
 
-    state = int(_sequence(seed, role).generate_state(1, np.uint64)[0])
-    return torch.Generator().manual_seed(state >> 1)
+    return torch.Generator().manual_seed(_state(seed, role) >> 1)
+
+
+@lru_cache(maxsize=1024)
+def _state(seed: int, role: str) -> int:
+    return int(_sequence(seed, role).generate_state(1, np.uint64)[0])

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from dadiff.denoisers.description import describe
-from dadiff.denoisers.networks import RecordingNetwork
+from dadiff.denoisers.networks import RecordingNetwork, features_at, step_features
 from dadiff.denoisers.prediction import prediction
 from dadiff.denoisers.recipes import Recipe
 from dadiff.diffusion.schedule import Schedule
@@ -74,8 +74,10 @@ class NetworkDenoiser(nn.Module):
 
     def output(self, tau: Tensor, step: Tensor, environment: Tensor) -> Tensor:
         """The network's prediction, float32: tau (B, d), step (B,) or (1,), E (B, c) in physical units."""
-        scaled = (environment - self.environment_mean) / self.environment_scale
-        return self.network(tau, step, scaled)
+        return self._asked(tau, step_features(step), environment)
+
+    def _asked(self, tau: Tensor, features: Tensor, environment: Tensor) -> Tensor:
+        return self.network(tau, features, (environment - self.environment_mean) / self.environment_scale)
 
     @torch.inference_mode()
     def forward(self, tau: Tensor, i: int, environment: Tensor) -> Tensor:
@@ -91,10 +93,8 @@ class NetworkDenoiser(nn.Module):
         self._check(tau, environment)
         E = environment.expand(*tau.shape[:-1], self.condition.size).reshape(-1, self.condition.size)
         flat = tau.reshape(-1, tau.shape[-1])
-        step = torch.full((1,), i, device=tau.device)
-        outputs = [
-            self.output(x.float(), step, e.float()) for x, e in zip(flat.split(CHUNK), E.split(CHUNK), strict=True)
-        ]
+        step, pieces = features_at(i, tau.device), zip(flat.split(CHUNK), E.split(CHUNK), strict=True)
+        outputs = [self._asked(x.float(), step, e.float()) for x, e in pieces]
         output = (torch.cat(outputs) if outputs[1:] else outputs[0]).to(tau.dtype).reshape(tau.shape)
         return float(self.estimate_tau[i]) * tau + float(self.estimate_output[i]) * output
 

@@ -1,13 +1,14 @@
 """The networks: float32, (B, d) in and out, conditioned on the diffusion step and the scaled environment.
 
-Both take `forward(tau, step, environment)` with tau (B, d), step (B,) or (1,) and E (B, c), and return (B, d).
+All take `forward(tau, step, environment)` with tau (B, d), the step's features (B, 64) or (1, 64) and E (B, c), and
+return (B, d).
 What the output means (clean trajectory, noise, velocity) is not their concern.
 """
 
 from __future__ import annotations
 
 import math
-from functools import cache
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -23,15 +24,17 @@ EMBEDDING = 128
 
 def step_features(step: Tensor) -> Tensor:
     """Sines and cosines of the step at wavelengths from 2 pi to 2 pi 10^4 (Vaswani et al. 2017), (B, 64)."""
-    phase = step[:, None] * _frequencies(step.device)
+    half = STEP_FEATURES // 2
+    frequency = torch.exp(torch.arange(half, device=step.device) * (-math.log(1e4) / (half - 1)))
+    phase = step[:, None] * frequency
     return torch.cat([phase.sin(), phase.cos()], dim=-1)
 
 
-@cache
-def _frequencies(device: torch.device) -> Tensor:
-    half = STEP_FEATURES // 2
-    with torch.inference_mode(False):  # as training needs them, too
-        return torch.exp(torch.arange(half, device=device) * (-math.log(1e4) / (half - 1)))
+@lru_cache(maxsize=1024)
+def features_at(i: int, device: torch.device) -> Tensor:
+    """Those of one step that all plans share, (1, 64); made once."""
+    with torch.inference_mode(False):  # where gradients are recorded they are needed, too
+        return step_features(torch.full((1,), i, device=device))
 
 
 class Condition(nn.Module):
@@ -44,7 +47,7 @@ class Condition(nn.Module):
         self.mix = nn.Linear(width, width)
 
     def forward(self, step: Tensor, environment: Tensor) -> Tensor:
-        hidden = self.step(step_features(step)) + self.environment(environment)
+        hidden = self.step(step) + self.environment(environment)
         return functional.silu(self.mix(functional.silu(hidden)))
 
 
@@ -72,7 +75,7 @@ class ResidualNetwork(nn.Module):
         self.output = nn.Linear(width, size)
 
     def forward(self, tau: Tensor, step: Tensor, environment: Tensor) -> Tensor:
-        hidden = self.trajectory(tau) + self.step(step_features(step)) + self.environment(environment)
+        hidden = self.trajectory(tau) + self.step(step) + self.environment(environment)
         return self.output(self.blocks(hidden))
 
 
