@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from dadiff.reporting import tables
-from dadiff.reporting.aggregation import Evidence
+from dadiff.reporting.aggregation import Evidence, Method
 from dadiff.reporting.definitions import load
 from dadiff.reporting.leaderboard import median, places, wins
+from dadiff.reporting.naming import short_names
 from dadiff.reporting.sources import read_sweeps
 
 STORE = Path(__file__).parent / "data" / "store"
@@ -93,3 +94,22 @@ def test_claims_are_about_the_cells_that_a_report_judges(evidence):
     assert evidence.of({}) is evidence
     found = evidence.of({"denoiser": {"not": "gaussian"}}).all_methods
     assert [m.axes for m in found] == [m.axes for m in evidence.all_methods if m.axes["denoiser"] != "gaussian"]
+
+
+def _methods(*axes: dict) -> list[Method]:
+    return [Method({"projector": "known", **own}, []) for own in axes]
+
+
+def test_names_leave_out_what_most_methods_share_and_stay_apart():
+    many = [{"enforcement": f"e{k}", "denoiser": "mlp", "sampler": "ddim", "sampler.num_steps": 5} for k in range(7)]
+    once = {"enforcement": "e0", "denoiser": "mlp", "sampler": "ddim", "sampler.num_steps": 1}
+    other = {"enforcement": "e0", "denoiser": "gaussian", "sampler": "ddim", "sampler.num_steps": 5}
+    shown = ["enforcement", "denoiser", "sampler"]
+    names, usual = short_names(_methods(*many, once, other), shown)
+    assert usual == "mlp, ddim"
+    assert names == [*(f"e{k}" for k in range(7)), "e0, one call", "e0, exact denoiser"]
+    few, nothing = short_names(_methods(*many[:3]), shown)
+    assert nothing == ""
+    assert few[0] == "e0, mlp, ddim"
+    twice = {"enforcement": "e0", "sampler": "ddim", "sampler.num_steps": 5}
+    assert short_names(_methods(*many, twice), shown)[1] == ""

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import re
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -379,14 +379,17 @@ def dense(table: pd.DataFrame, columns: str | list[str], *, where: str) -> np.nd
 
 def varying(methods: list[Method]) -> list[str]:
     """The fewest axes that tell methods apart, taken in the order of `FIRST`, then choices before parameters."""
-    names = dict.fromkeys(name for method in methods for name in method.axes)
-    rank = {name: index for index, name in enumerate(FIRST)}
-    ordered = sorted(names, key=lambda name: (rank.get(name, len(FIRST)), "." in name))
     chosen: list[str] = []
-    for name in ordered:
+    for name in in_order(name for method in methods for name in method.axes):
         if _distinct(methods, [*chosen, name]) > _distinct(methods, chosen):
             chosen.append(name)
     return chosen
+
+
+def in_order(names: Iterable[str]) -> list[str]:
+    """Axes in the order of `FIRST`, then choices before parameters."""
+    rank = {name: index for index, name in enumerate(FIRST)}
+    return sorted(dict.fromkeys(names), key=lambda name: (rank.get(name, len(FIRST)), "." in name))
 
 
 def _distinct(methods: list[Method], axes: list[str]) -> int:

@@ -25,7 +25,7 @@ from typing import Any
 import yaml
 
 from dadiff.errors import ConfigError
-from dadiff.reporting.aggregation import Evidence, Method, varying
+from dadiff.reporting.aggregation import Evidence, Method, in_order, varying
 from dadiff.reporting.labels import axis_name, axis_value, number
 from dadiff.reporting.measures import MEASURES, Measured
 from dadiff.reporting.selection import described
@@ -220,7 +220,7 @@ def sentence(findings: list[Finding]) -> str:
 
 def shared(inside: list[Finding], outside: list[Finding]) -> str:
     """The axis that tells some findings from others, in words; empty if none does."""
-    for axis in dict.fromkeys(name for finding in (*inside, *outside) for name in finding.axes):
+    for axis in in_order(name for finding in (*inside, *outside) for name in finding.axes):
         these, those = ({repr(f.axes.get(axis)): f.axes.get(axis) for f in group} for group in (inside, outside))
         if not these.keys() & those.keys() and not any(isinstance(value, list) for value in these.values()):
             return _one_of(axis, list(these.values()))

@@ -116,7 +116,8 @@ def _table(content: Mapping[str, Any]) -> str:
         *(f"{column_name(metric)}{' × ' + table['baseline'] if ratio else ''}" for metric, ratio in columns),
     ]
     rows = [[row["label"], *_cells(row, columns)] for row in table["rows"]]
-    csv = f"All numbers: [tables/{name}.csv](tables/{name}.csv)."
+    usual = f"Names leave out what most have: {table['usual']}. " if table.get("usual") else ""
+    csv = f"{usual}All numbers: [tables/{name}.csv](tables/{name}.csv)."
     return f"## {part['title']}\n\n{markdown(head, rows)}\n\n{csv}"
 
 

@@ -91,6 +91,8 @@ def _part(item: Item, evidence: Evidence) -> Part:
     content = item.collect(evidence, **item.options)
     runs = list(dict.fromkeys(content.runs))
     told = facts(evidence, runs, intervals=item.kind not in WITHOUT_INTERVALS)
+    usual = getattr(content, "usual", "")
+    told += f" Names leave out what most have: {usual}." if usual else ""
     return Part(item, content, told, content.notes, runs)
 
 

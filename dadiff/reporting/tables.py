@@ -12,6 +12,7 @@ from dadiff.outside import spreadsheet_safe
 from dadiff.reporting.aggregation import LEVELS, Evidence, Method, has_metric, pair, varying
 from dadiff.reporting.labels import FLOORS, METRICS, method_name
 from dadiff.reporting.leaderboard import Place, at_their_best, places
+from dadiff.reporting.naming import short_names
 from dadiff.reporting.selection import Selector, matches
 from dadiff.reporting.statistics import Estimate, difference, mean, ratio
 from dadiff.store.record import ABOUT_DATA, is_odd
@@ -39,12 +40,14 @@ class Row:
 
 @dataclass(frozen=True)
 class Table:
-    """Rows and the order of the metrics; `baseline` names what ratios are relative to, `odd` what is odd about data."""
+    """Rows and the order of the metrics; `baseline` names what ratios are relative to, `odd` what is odd about data,
+    `usual` what names of methods leave out."""
 
     metrics: list[str]
     baseline: str
     rows: list[Row]
     odd: list[str] = field(default_factory=list)
+    usual: str = ""
 
     @property
     def runs(self) -> list[str]:
@@ -87,12 +90,13 @@ def collect(
     metrics = [name for asked in metrics for name in (_own(methods) if asked == "..." else [asked])]
     wanted = dict.fromkeys([*metrics, *ABOUT_DATA])
     kept = [name for name in wanted if any(m.finished and has_metric(m.finished, name) for m in methods)]
-    rows = [_row(evidence, method, kept, shown, relative_to, group) for method in methods]
+    names, usual = short_names(methods, shown) if ranked_by else ([method_name(m.axes, shown) for m in methods], "")
+    rows = [_row(evidence, method, name, kept, relative_to, group) for method, name in zip(methods, names, strict=True)]
     if beside:
         kept, rows = _beside(evidence, methods, kept, rows, **beside)
     if ranked_by:
         kept, rows = _ranked(evidence, methods, kept, rows, ranked_by, relative_to)
-    return Table(kept, method_name(dict(relative_to), relative_to) if relative_to else "", rows, _odd(methods))
+    return Table(kept, method_name(dict(relative_to), relative_to) if relative_to else "", rows, _odd(methods), usual)
 
 
 def _beside(
@@ -102,7 +106,7 @@ def _beside(
     """The metrics and rows with those of each method's counterpart, which is asked for by `of`."""
     asked = [method if method.finished and matches(method.axes, cells) else None for method in methods]
     others = [None if method is None else evidence.partner(method, of) for method in asked]
-    found = [_row(evidence, other, metrics, [], None, None).values if other else {} for other in others]
+    found = [_row(evidence, other, "", metrics, None, None).values if other else {} for other in others]
     added = [name for name in metrics if any(values.get(name) for values in found)]
     return [*kept, *added], [
         replace(row, values=row.values | {name: values.get(name) for name in added})
@@ -147,8 +151,8 @@ def _own(methods: list[Method]) -> list[str]:
 def _row(
     evidence: Evidence,
     method: Method,
+    name: str,
     metrics: list[str],
-    shown: list[str],
     baseline: Selector | None,
     group: str | None,
 ) -> Row:
@@ -157,7 +161,7 @@ def _row(
     for metric in metrics:
         there = method.finished and has_metric(method.finished, metric)
         values[metric] = _value(method, other, metric, group) if there else None
-    return Row(method_name(method.axes, shown), values, method.outcome, method.counts(), method.keys)
+    return Row(name, values, method.outcome, method.counts(), method.keys)
 
 
 def _value(method: Method, other: Method | None, metric: str, group: str | None) -> Value:

@@ -49,11 +49,14 @@ class Boundary:
 
     @property
     def found(self) -> str:
-        """In how many cells each method is clearly better than the baseline."""
+        """In how many cells the methods are clearly better than the baseline, and which is most and least often."""
         if not self.panels:
             return ""
-        told = [f"{panel.label} in {_better(panel)} of {_count(panel)}" for panel in self.panels]
-        return f"Clearly better than {self.baseline}: {'; '.join(told)}"
+        told = [f"{panel.label} in {_better(panel)} of {_count(panel)}" for panel in sorted(self.panels, key=_share)]
+        if len(told) < 3:
+            return f"Clearly better than {self.baseline}: {'; '.join(told)}"
+        better, cells = (sum(map(count, self.panels)) for count in (_better, _count))
+        return f"Clearly better than {self.baseline} in {better} of {cells}; most: {told[-1]}; least: {told[0]}"
 
     def draw(self, columns: int) -> Figure:
         """A panel a method; a thick line runs between cells on either side of 1."""
@@ -87,6 +90,10 @@ def _count(panel: Panel) -> int:
 
 def _better(panel: Panel) -> int:
     return sum(estimate is not None and estimate.high < 1 for row in panel.ratios for estimate in row)
+
+
+def _share(panel: Panel) -> float:
+    return _better(panel) / _count(panel)
 
 
 def _draw_cell(ax: Axes, x: int, y: int, estimate: Estimate | None) -> None:

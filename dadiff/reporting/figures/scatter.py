@@ -9,8 +9,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from dadiff.reporting.aggregation import Evidence, Method, has_metric, varying
-from dadiff.reporting.figures.style import Look, label_points, legend_below, log_axis, looks_of, panels, tag
-from dadiff.reporting.labels import FLOORS, ROUNDING, method_name, metric_name
+from dadiff.reporting.figures.style import SIDE, Look, label_points, legend_below, log_axis, looks_of, panels, tag
+from dadiff.reporting.labels import FLOORS, ROUNDING, column_name
+from dadiff.reporting.naming import short_names
 from dadiff.reporting.selection import Selector
 from dadiff.reporting.statistics import Estimate, mean
 
@@ -35,6 +36,7 @@ class Scatter:
     diagonal: bool
     runs: list[str]
     notes: list[str]
+    usual: str = ""
 
     def draw(self, columns: int) -> Figure:
         """One panel with both axes logarithmic."""
@@ -44,7 +46,7 @@ class Scatter:
         for point, own in zip(self.points, looks, strict=True):
             look = own if point in self.named else OTHERS
             bars = [[[e.value - e.low], [e.high - e.value]] for e in (point.x, point.y)]
-            x, y = _shown(point.x), _shown(point.y)
+            x, y = _place(point)
             whiskers = ax.errorbar(x, y, bars[1], bars[0], fmt="none", color=look.colour, capsize=2, lw=1)
             label = point.label if point in self.named else "_"
             (mark,) = ax.plot(x, y, ls="", ms=7, label=label, zorder=2 + (point in self.named), **look.points)
@@ -56,11 +58,14 @@ class Scatter:
             ax.plot(line, line, color="#888888", lw=0.8, ls=":", zorder=0)
         log_axis(ax, "x")
         log_axis(ax, "y")
-        ax.set_xlabel(metric_name(self.x))
-        ax.set_ylabel(metric_name(self.y))
+        ax.set_xlabel(column_name(self.x))
+        ax.set_ylabel(column_name(self.y))
         if columns > 1:
-            found = zip(self.points, looks, strict=True)
-            label_points(ax, [(p.label, _shown(p.x), _shown(p.y), look) for p, look in found if p in self.named])
+            found = [(p, look) for p, look in zip(self.points, looks, strict=True) if p in self.named]
+            beside = len(found) < len(self.points)
+            label_points(ax, [(p.label, *_place(p), look) for p, look in found], beside=beside)
+            if beside:
+                figure.set_layout_engine("constrained", w_pad=SIDE)
         else:
             legend_below(figure, [ax])
         return figure
@@ -78,19 +83,25 @@ MOST_NAMED, BEST = 12, 5
 OTHERS = Look("#8c8c8c", "o", "-", "full")
 
 
-def _shown(estimate: Estimate) -> float:
-    return max(estimate.value, ROUNDING)
+def _place(point: Point) -> tuple[float, float]:
+    return max(point.x.value, ROUNDING), max(point.y.value, ROUNDING)
 
 
 def collect(evidence: Evidence, *, x: str, y: str, cells: Selector, diagonal: bool = False) -> Scatter:
-    """Means of two metrics over replicates, cases and plans."""
+    """Means of two metrics above what they cannot go below, over replicates, cases and plans."""
     methods = evidence.methods(cells)
-    alive = [m for m in methods if m.finished and has_metric(m.finished, x) and has_metric(m.finished, y)]
-    shown = varying(methods)
-    points = [Point(method_name(m.axes, shown), m.axes, _mean(m, x), _mean(m, y)) for m in alive]
-    notes = [f"{method_name(m.axes, shown)}: {m.outcome}" for m in methods if m.lost]
-    return Scatter(x, y, points, diagonal, [key for m in alive for key in m.keys], notes)
+    names, usual = short_names(methods, varying(methods))
+    alive = [
+        (name, m)
+        for name, m in zip(names, methods, strict=True)
+        if m.finished and has_metric(m.finished, x) and has_metric(m.finished, y)
+    ]
+    points = [Point(name, m.axes, _mean(m, x), _mean(m, y)) for name, m in alive]
+    notes = [f"{name}: {m.outcome}" for name, m in zip(names, methods, strict=True) if m.lost]
+    return Scatter(x, y, points, diagonal, [key for _, m in alive for key in m.keys], notes, usual)
 
 
 def _mean(method: Method, metric: str) -> Estimate:
-    return mean(method.runs.scalars(metric), FLOORS.get(metric, 0))
+    floor = FLOORS.get(metric, 0.0)
+    found = mean(method.runs.scalars(metric), floor)
+    return Estimate(found.value - floor, found.low - floor, found.high - floor)

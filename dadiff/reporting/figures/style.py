@@ -190,23 +190,28 @@ def _place(ax: Axes, y: float) -> float:
     return min(max((y - low) / (high - low), 0.0), 1.0)
 
 
-def label_points(ax: Axes, points: Sequence[tuple[str, float, float, Look]]) -> None:
-    """Names to the right of points (label, x, y, look), moved apart where they would overlap; room is made for them."""
+def label_points(ax: Axes, points: Sequence[tuple[str, float, float, Look]], *, beside: bool = False) -> None:
+    """Names to the right of points (label, x, y, look), moved apart where they would overlap; room is made for them.
+
+    Args:
+        beside: the names stand beside the panel, since there are other points.
+    """
     low, high = ax.get_xlim()
-    ax.set_xlim(low, high * (high / low) ** POINT_ROOM)
-    _name(ax, [label for label, *_ in points], lambda ax: _place_points(ax, points))
+    if not beside:
+        ax.set_xlim(low, high * (high / low) ** POINT_ROOM)
+    _name(ax, [label for label, *_ in points], lambda ax: _place_points(ax, points, beside=beside))
 
 
-def _place_points(ax: Axes, points: Sequence[tuple[str, float, float, Look]]) -> None:
+def _place_points(ax: Axes, points: Sequence[tuple[str, float, float, Look]], *, beside: bool) -> None:
     low, high = map(math.log10, ax.get_xlim())
     ordered = sorted(points, key=lambda point: point[2])
     places = _apart([_place(ax, y) for _, _, y, _ in ordered], [POINT_GAP] * len(ordered))
     for (label, x, y, look), place in zip(ordered, places, strict=True):
         line = {"arrowstyle": "-", "color": look.colour, "lw": 0.6, "shrinkA": 0, "relpos": (0, 0.5)}
         near = [other for _, other, level, _ in points if 1 <= other / x < CLUSTER and 1 / 10 < level / y < 10]
-        beside = (math.log10(max(near)) - low) / (high - low) + 0.03, place
+        right = 1.02 if beside else (math.log10(max(near)) - low) / (high - low) + 0.03
         text = ax.annotate(
-            label, (x, y), beside, textcoords="axes fraction", fontsize=7.5, va="center", arrowprops=line
+            label, (x, y), (right, place), textcoords="axes fraction", fontsize=7.5, va="center", arrowprops=line
         )
         text.set_gid(f"{CHOICE}{label}")
 
@@ -220,6 +225,8 @@ _NAMED: WeakKeyDictionary[Axes, tuple[set[str], Callable[[Axes], None]]] = WeakK
 """What is named in a panel, and how it is placed, which is done anew when an axis becomes linear."""
 
 POINT_GAP, POINT_ROOM, CLUSTER = 0.062, 0.3, 1.8
+SIDE = 0.15
+"""Inches at the sides of a panel with names beside it, which are a little wider at other resolutions."""
 MOST_LINES, LABEL_GAP, WRAPPED = 12, 0.075, 46
 
 
