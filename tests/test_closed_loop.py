@@ -65,6 +65,13 @@ def test_gains_help_where_plans_are_seldom():
     assert mean["tracking"] < mean["receding"]
 
 
+def test_an_expert_that_is_quicker_than_the_clock_has_no_share_of_time(monkeypatch):
+    monkeypatch.setattr("dadiff.control.controllers.time.process_time", lambda: 1.0)
+    table = bench(replan_every=(30,), controllers=("receding",)).table()
+    assert table["time_share"].isna().all()
+    assert table["cost_ratio"].notna().all()
+
+
 def test_costs_are_over_those_of_the_expert_at_the_shortest_interval():
     table = bench(replan_every=(10, 5), controllers=("optimal",)).table()
     mean = table.groupby("every")["cost_ratio"].mean()

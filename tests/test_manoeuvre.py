@@ -162,3 +162,7 @@ def test_a_run_closes_the_loop_with_whatever_robot_the_planner_believes_in(overr
         assert metrics["closed_loop_same_modelled_5"] != 1
         assert metrics["model_cost_ratio"] > 1
         assert metrics["prediction_error"] > 0
+
+
+def test_a_manoeuvre_of_one_step_is_one():
+    assert Manoeuvre(**{**SMALL, "horizon": 1}).horizon == 1

@@ -72,15 +72,16 @@ def test_a_waypoint_due_half_way_is_a_late_one() -> None:
     assert (distance.min() >= 0.5) & (distance.max() <= 2)
 
 
-def test_discs_on_the_way_lie_beside_it_between_two_steps_after_the_early_and_before_the_late_waypoint() -> None:
-    given = replace(Obstacles().distribution_for(0.1), near=1.0)
+@pytest.mark.parametrize("late", [20, 33])
+def test_discs_on_the_way_lie_beside_it_between_two_steps_after_the_early_and_before_the_late_waypoint(late) -> None:
+    given = replace(Obstacles().distribution_for(0.1), near=1.0, times=(5, late))
     path = np.random.default_rng(0).standard_normal((2000, 41, 2)).cumsum(axis=1)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("dadiff.tasks.obstacle_distribution._ASIDE", 0.0)
         centre = given._centres(path, np.random.default_rng(1))
     distance = np.linalg.norm(path - centre[:, None], axis=-1)
     assert distance.min(axis=1).max() == 0
-    assert set(distance.argmin(axis=1)) == set(range(5 + 2, 33 - 2 + 1))
+    assert set(distance.argmin(axis=1)) == set(range(5 + 2, late - 2 + 1))
     aside = given._centres(path, np.random.default_rng(1)) - centre
     along = np.stack([path[k, t + 1] - path[k, t - 1] for k, t in enumerate(distance.argmin(axis=1))])
     np.testing.assert_allclose((aside * along).sum(axis=1), 0, atol=1e-12)

@@ -202,6 +202,7 @@ def test_of_the_plans_for_one_case_that_is_selected_which_was_moved_least():
     for tau in (TAU, EPS):
         close(rival.sample(tau, at), corrected(tau, IDENTITY))
         moved = moved + (corrected(tau, IDENTITY) - tau).norm(dim=-1)
+    close(at.memory["moved"], moved)
     best = int(moved[:2].argmin())
     close(rival.end(TAU, at), TAU[[best, best, 2]])
     fleet = replace(at, environment=E[None].expand(2, -1, -1), memory={"moved": torch.stack([moved, -moved])})

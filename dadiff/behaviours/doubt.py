@@ -136,7 +136,7 @@ class ByPlan:
         x, u = self.layout.split(z * self.scale + self.mean)
         phi = join([x[..., :-1, :], u], -1)
         if self.root.shape[-2] > phi.shape[-1]:
-            phi = join([phi, 0 * phi[..., :1] + 1], -1)
+            phi = join([phi, phi[..., :1] ** 0], -1)
         V = phi @ self.root[..., None, :, :]  # (*robots, plans, T, n k)
         return V.reshape(*V.shape[:-2], self.G.shape[-2], -1)
 

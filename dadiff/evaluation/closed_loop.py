@@ -64,7 +64,8 @@ class Bench:
 
         cost_ratio is against the expert at the shortest interval, cost_ratio_same against it at the same one; distance
         is |x(K) - goal|, largest_input max |u|, seconds the processor time that a plan took in the batch, time_share it
-        over the expert's. An episode that left float range has cost_ratio inf.
+        over the expert's, nan where that was over before the clock moved. An episode that left float range has
+        cost_ratio inf.
         """
         intervals, rows = sorted(self.evaluation.replan_every), []
         yardsticks = {every: self._driven("optimal", every) for every in intervals}
@@ -73,7 +74,7 @@ class Bench:
             for kind in self.evaluation.controllers:
                 episode, spent = (same, seconds) if kind == "optimal" else self._driven(kind, every)
                 rows.append(self._rows(episode, best, self._cost(same)).assign(
-                    controller=kind, every=every, seconds=spent, time_share=spent / seconds
+                    controller=kind, every=every, seconds=spent, time_share=spent / (seconds or np.nan)
                 ))  # fmt: skip
         return pd.concat(rows, ignore_index=True)
 
