@@ -199,3 +199,9 @@ def test_of_sparse_dynamics_only_the_terms_that_are_kept_are_doubted():
     np.testing.assert_array_equal(soft.system.theta != 0, soft.root.any(axis=-1).T)
     with pytest.raises(NotApplicableError, match="use projector=identified_sparse"):
         IdentifiedSparseSoft(features=FLYING, angles=(2,), bounds="enforced").fit(layout, PlanarQuadrotor(), recording)
+
+
+def test_pins_take_freedom_from_it():
+    held = Pin.initial_state(LAYOUT, X_INIT)
+    assert doubted().bind().info.rank == LAYOUT.rank
+    assert doubted().bind(pins=[held]).info.rank == LAYOUT.rank - 2

@@ -91,6 +91,13 @@ def test_discs_on_the_way_lie_beside_it_between_two_steps_after_the_early_and_be
 def test_what_is_not_redrawn_is_not_counted() -> None:
     _, notes = Obstacles(max_obstacles=0).distribution_for(0.1).sample(50, np.random.default_rng(0))
     assert notes == {"environments_redrawn": 0, "centres_redrawn_mean": 0}
+    easy, hard = (
+        Obstacles(distribution=name)
+        .distribution_for(0.1)
+        .sample(50, np.random.default_rng(0))[1]["centres_redrawn_mean"]
+        for name in ("default", "hard")
+    )
+    assert hard > 2 * easy > 0
 
 
 @pytest.mark.parametrize(
