@@ -103,6 +103,13 @@ BAD = [
 ]
 
 
+def test_a_waypoint_may_be_due_at_the_first_step_and_at_the_last_but_one(tmp_path: Path) -> None:
+    at_ends = changed(waypoints=[waypoint([0.1, 0.1], 1), waypoint([2.5, 1.2], 39)])
+    task = Obstacles()
+    E = load_environments(write(tmp_path, [at_ends]), task)
+    np.testing.assert_array_equal(decode(E, task.condition(), task.horizon).time, [[1, 39]])
+
+
 @pytest.mark.parametrize(("environment", "error", "message"), BAD, ids=[message for *_, message in BAD])
 def test_bad_environments_are_named_in_one_line(
     tmp_path: Path, environment: Any, error: type[DadiffError], message: str
