@@ -35,7 +35,7 @@ def table(rows: Sequence[Row]) -> str:
 
 def markdown(rows: Sequence[Row], machine: str) -> str:
     """The table for the documentation."""
-    lines = [f"Measured by `python -m bench` on {machine}. Written by it; not edited.", ""]
+    lines = ["# Speed, measured", "", f"Measured by `python -m bench` on {machine}. Written by it; not edited.", ""]
     lines += ["| what | ours | other | ratio | against |", "|---|---|---|---|---|"]
     for row in rows:
         other = "" if row.other is None else f"{row.other:.4g} {row.unit}"

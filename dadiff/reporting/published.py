@@ -138,7 +138,8 @@ def _again(content: Mapping[str, Any]) -> str:
 
 
 def index(root: Path, claims: list[Claim]) -> str:
-    """All published reports with their first sentence, and one verdict a claim: that of the report that weighs most."""
+    """All published reports with their first sentence, the best of every leaderboard, and one verdict a claim: that of
+    the report that weighs most."""
     contents = {folder.name: read(folder) for folder in folders(root)}
     rows = []
     for name, content in contents.items():
@@ -150,10 +151,30 @@ def index(root: Path, claims: list[Claim]) -> str:
         [
             "# Published reports",
             markdown(head, rows),
+            *_leaderboards(contents),
             "## One verdict a claim",
             markdown(["claim", "verdict", "report"], leaders),
         ]
     ) + "\n"  # fmt: skip
+
+
+LEADERS = 5
+
+
+def _leaderboards(contents: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """The first rows of main tables that rank their methods."""
+    parts = []
+    for name, content in contents.items():
+        found = main_table(content)
+        if found is None or "wins" not in found[1]["content"]["metrics"]:
+            continue
+        table = found[1]["content"]
+        columns = main_columns(table)
+        head = ["method", *(column_name(metric) for metric, _ in columns)]
+        rows = [[row["label"], *_cells(row, columns)] for row in table["rows"][:LEADERS]]
+        link = f"The first {len(rows)} of {len(table['rows'])} in [{name}]({name}/README.md)."
+        parts += [f"## {found[1]['title']}: {name}", markdown(head, rows), link]
+    return parts
 
 
 def verdicts(root: Path, claims: list[Claim]) -> list[tuple[str, Line]]:

@@ -163,7 +163,7 @@ def _compared(content: Mapping[str, Any]) -> list[str]:
     rows = [(row["label"], ratio_of(row, metric)) for row in table["rows"]]
     compared = [(label, ratio) for label, ratio in rows if ratio and label.split(",")[0] != baseline and ratio != SAME]
     if not compared:
-        return []
+        return _extremes(table, metric)
     name = column_name(metric).split(" ‖")[0]
     better = sorted((found for found in compared if found[1].high < 1), key=lambda found: found[1].value)
     worse = sorted((found for found in compared if found[1].low > 1), key=lambda found: -found[1].value)
@@ -250,6 +250,8 @@ def _fared(lines: list[Line]) -> list[str]:
         return []
     counts = {word: sum(line.word == word for line in tested) for word in FARED}
     told = [f"{count} {FARED[word][count > 1]}" for word, count in counts.items() if count]
+    if len(tested) == 1:
+        return [f"The one claim tested here {_listed(told).removeprefix('1 ')}."]
     return [f"Of {len(tested)} claims tested here {_listed(told)}."]
 
 

@@ -5,6 +5,7 @@ Serves cost ratios, collisions, and gains; on the fleet every dot is a robot.
 
 from __future__ import annotations
 
+import textwrap
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,6 +21,9 @@ from dadiff.reporting.statistics import Estimate, mean
 
 MANY_DOTS = 6000
 """In a panel; more are drawn as one picture in svg and pdf, which keeps the files small."""
+
+TITLE = 46
+"""Letters of a panel's title in a line."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +61,8 @@ class Methods:
         figure, axes = panels(len(self.metrics), columns, width=width, height=0.9 + 0.32 * len(self.rows[0]))
         for index, (ax, metric, rows) in enumerate(zip(axes, self.metrics, self.rows, strict=True)):
             _draw_rows(ax, rows, log=self.log, below=rounding(metric))
-            ax.set_title(column_name(metric) if self.above else metric_name(metric))
+            title = column_name(metric) if self.above else metric_name(metric)
+            ax.set_title("\n".join(textwrap.wrap(title, TITLE)))
             ax.tick_params(labelleft=index % columns == 0)
             if self.above:
                 _say_values(ax, rows)
