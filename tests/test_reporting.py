@@ -593,6 +593,8 @@ def test_many_dots_are_strokes_at_their_places():
     layers = [list(drawings.segments(data, 1))[::2] for data in re.findall(r'd="((?:m[^"a-z]+h0)+)"', small.decode())]
     assert len(pairs) == 50
     assert len(layers) == drawings.LAYERS
+    (rounded,) = re.findall(r"\.(\w+)\{stroke-linecap:round\}", small.decode())
+    assert len(re.findall(rf'h0" class="{rounded}"/>', small.decode())) == drawings.LAYERS
     for k, layer in enumerate(layers):
         asked = np.array(pairs[k :: drawings.LAYERS], float)
         drawn = np.array([place for _, place in layer]) / 10

@@ -19,6 +19,8 @@ OFTEN = 3
 CROWD = 9
 GRID = (2, 4)
 """Tenths of a point that dots of crowds are placed to, across and down: a tenth of their size."""
+ROUND = "stroke-linecap:round"
+"""Of dots, and said by each path of them: matplotlib's rule for all elements comes before what a group says."""
 LAYERS = 3
 """Paths that many translucent dots are shared out to, so that where they crowd they are darker, as before."""
 PLACES = ("x", "y", "width", "height")
@@ -89,7 +91,10 @@ def _tidy_attributes(element: Element, rules: dict[str, str], decimals: int) -> 
         element.attrib.pop("transform", None)
     if element.tag == _name("path"):
         parts = list(segments(element.get("d", ""), decimals))
-        element.set("d", _dots(parts) if _is_dots(parts) else path(parts, decimals))
+        dots = _is_dots(parts)
+        element.set("d", _dots(parts) if dots else path(parts, decimals))
+        if dots:
+            element.set("style", _merged(element.get("style", ""), ROUND))
 
 
 def segments(data: str, decimals: int) -> Iterator[Segment]:
@@ -150,9 +155,10 @@ def _written(value: int, decimals: int) -> str:
 
 
 def _is_dots(parts: list[Segment]) -> bool:
-    """Whether a path is of lines without length alone."""
+    """Whether a path is of several lines without length alone; a single one is a whisker that rounds to none."""
     kinds = "".join(kind for kind, _ in parts)
-    return bool(re.fullmatch("(ML)+", kinds)) and all(parts[k][1] == parts[k + 1][1] for k in range(0, len(parts), 2))
+    whole = re.fullmatch(f"(ML){{{CROWD // LAYERS},}}", kinds)
+    return bool(whole) and all(parts[k][1] == parts[k + 1][1] for k in range(0, len(parts), 2))
 
 
 def _dots(parts: Iterable[Segment]) -> str:
@@ -175,9 +181,9 @@ def _merge_marks(group: Element, shapes: dict[str, Element]) -> None:
     places = [(float(mark.get("x", 0)), float(mark.get("y", 0))) for mark in group]
     parts = list(segments(shape.get("d", ""), DECIMALS))
     if [kind for kind, _ in parts] == ["M", "L"]:
-        _replace(group, [_ticks(places, parts)], _merged(style, shape.get("style", "")))
+        _replace(group, [{"d": _ticks(places, parts)}], _merged(style, shape.get("style", "")))
     elif [kind for kind, _ in parts] == ["M", *"CCCCCCCC", "Z"] and len(places) >= CROWD and "stroke" not in style:
-        layers = [_dots(_lines(places[layer::LAYERS])) for layer in range(LAYERS)]
+        layers = [{"d": _dots(_lines(places[layer::LAYERS])), "style": ROUND} for layer in range(LAYERS)]
         _replace(group, layers, _stroke(style, abs(2 * segments_of(shape)[0][1][1] / 100)))
     elif style:
         group.set("style", style)
@@ -207,15 +213,15 @@ def _ticks(places: list[tuple[float, float]], shape: list[Segment]) -> str:
 def _stroke(style: str, width: float) -> str:
     """The style of a disc as that of a stroke of its width with round ends."""
     inked = re.sub(r"^fill(?=[:-])|(?<=;)fill(?=[:-])", "stroke", style)
-    return f"fill:none;{inked};stroke-width:{width:g};stroke-linecap:round"
+    return f"fill:none;{inked};stroke-width:{width:g}"
 
 
-def _replace(group: Element, paths: list[str], style: str) -> None:
+def _replace(group: Element, paths: list[dict[str, str]], style: str) -> None:
     """A group's marks by paths of one style."""
     for mark in list(group):
         group.remove(mark)
-    for data in paths:
-        ElementTree.SubElement(group, _name("path"), {"d": data})
+    for attributes in paths:
+        ElementTree.SubElement(group, _name("path"), attributes)
     group.set("style", style)
 
 
