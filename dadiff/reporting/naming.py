@@ -11,12 +11,12 @@ from dadiff.reporting.labels import axis_value, method_name
 
 
 def short_names(methods: list[Method], shown: Sequence[str]) -> tuple[list[str], str]:
-    """Names of methods without the denoiser and the sampler that most of them share; and which those are, in words.
+    """Names of methods without the denoiser, training and sampler that most share; and which those are, in words.
 
     Nothing is left out of few methods, or where two would have one name.
     """
     whole = [method_name(method.axes, shown) for method in methods]
-    common = {axis: _most_common(methods, axis) for axis in ("denoiser", "sampler") if axis in shown}
+    common = {axis: _most_common(methods, axis) for axis in ("denoiser", "training", "sampler") if axis in shown}
     left_out = {axis: value for axis, value in common.items() if value is not None}
     short = [method_name(_without(method.axes, left_out), shown) for method in methods]
     if len(methods) < MANY or not left_out or len(set(short)) < len(set(whole)):
