@@ -8,7 +8,7 @@ the findings alone: a word, how many are so, open and not so, and the exceptions
     so and not so          holds only if <what sets them apart>, or holds for 22 of 26; not: <which>
     so and open            holds for 22 of 26; open: 4
     all three              holds for 22 of 26; not: <which>; open: 3
-    none so                does not hold, undecided, or both by their numbers
+    none so                does not hold, undecided, or both by their numbers; the word is that of more
     nothing to test        not tested here
 
 "Only" is said where nothing is open. Methods whose projector is the identity, which diverged or were refused, and those
@@ -191,7 +191,7 @@ def word(counts: Mapping[str, int]) -> str:
         return "not tested here"
     if so:
         return "holds in part" if open_ + no else "holds"
-    return "does not hold" if not open_ else "undecided"
+    return "does not hold" if no > open_ else "undecided"
 
 
 def sentence(findings: list[Finding]) -> str:
