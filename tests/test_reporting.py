@@ -27,6 +27,7 @@ from dadiff.errors import ConfigError, StoreError
 from dadiff.outside import without_passwords
 from dadiff.reporting import cli, configurations, drawings, labels, latex, slim
 from dadiff.reporting.aggregation import Evidence, grid, pair, varying
+from dadiff.reporting.compare import compared
 from dadiff.reporting.definitions import FOLDER, Item, for_sweep, load, names
 from dadiff.reporting.figures import diffusion, paths
 from dadiff.reporting.figures.style import COLOURS, INK, MARKERS, OTHER, RC, looks_of, render
@@ -715,3 +716,12 @@ def test_the_command_ends_with_what_was_found_and_compares(tmp_path, capsys):
     assert cli.main(["one", "--output-dir", str(tmp_path), "--against", str(folder)]) == 0
     again = capsys.readouterr().out
     assert f"Against one: {len(rows)} of {len(rows)} numbers lie within its intervals." in again
+
+
+def test_reports_without_a_method_in_common_are_said_to_be_so(tmp_path):
+    here, there = ({"sweep": "s", "tables": {"all": {"content": {"metrics": ["gap"], "rows": rows}}}} for rows in (
+        [{"label": "known FF†", "values": {}}],
+        [{"label": name, "values": {}} for name in ("vanilla", "Hankel HH†", "roll-out")],
+    ))  # fmt: skip
+    (told,) = compared(here, there, tmp_path / "against.csv")
+    assert told == "Against s: no number in common; methods there are vanilla; Hankel HH†; …, here known FF†"

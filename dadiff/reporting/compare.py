@@ -51,6 +51,10 @@ def comparisons(content: Mapping[str, Any], other: Mapping[str, Any]) -> Iterato
 def compared(content: Mapping[str, Any], other: Mapping[str, Any], path: Path) -> list[str]:
     """What to say of both, and a file with every number."""
     found = list(comparisons(content, other))
+    if not found:
+        return [
+            f"Against {other['sweep']}: no number in common; methods there are {_named(other)}, here {_named(content)}"
+        ]
     head = ["table", "method", "metric", *(f"{name}_{end}" for name in ("here", "there") for end in ENDS), "within"]
     with path.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream, lineterminator="\n")
@@ -70,6 +74,12 @@ def compared(content: Mapping[str, Any], other: Mapping[str, Any], path: Path) -
 
 
 ENDS = ("value", "low", "high")
+
+
+def _named(content: Mapping[str, Any]) -> str:
+    """The first names of methods, for a reader to see in what they differ."""
+    labels = dict.fromkeys(row["label"] for part in content["tables"].values() for row in part["content"]["rows"])
+    return "; ".join([*list(labels)[:2], "…"] if len(labels) > 2 else labels) or "none"
 
 
 def _told(each: Comparison) -> str:
