@@ -435,6 +435,11 @@ def held_pins(names, layout, robots=()) -> list[Pin]:
 @pytest.mark.parametrize("held", HELD.values(), ids=HELD.keys())
 @pytest.mark.parametrize("robots", [SYSTEMS["n=5,m=2"], fleet()], ids=["one", "fleet"])
 class TestBothForms:
+    def test_their_rank_is_what_pins_leave_of_the_dynamics(self, monkeypatch, robots, held, metric):
+        layout = robots.layout(10)
+        for P in both_forms(monkeypatch, varying(robots, 10), layout, None, held_pins(held, layout, robots.robots)):
+            assert P.info.rank == layout.rank - len(held) * layout.state_dim
+
     def test_they_agree_and_what_comes_out_is_in_the_set(self, monkeypatch, robots, held, metric):
         layout = robots.layout(10)
         stages, where = varying(robots, 10), Coordinates(*np.random.default_rng(9).uniform(0.3, 3, (2, layout.size)))
@@ -549,6 +554,16 @@ def test_demonstrations_are_data_about_the_dynamics_too():
         Identified(learn_from="demonstrations").fit(many.layout(HORIZON), many, None, np.zeros((9, 39)))
 
 
+def test_demonstrations_say_as_much_of_a_fleet_of_one_robot():
+    system, shown = SYSTEMS["n=3,m=1"], trajectories(SYSTEMS["n=3,m=1"], HORIZON, 40)[0]
+    alone, fleet_of_one = (
+        Identified(learn_from="demonstrations").fit(system.layout(HORIZON), robots, demonstrations=shown)
+        for robots in (system, Linear(system.A[None], system.B[None], robots=1))
+    )
+    assert fleet_of_one.robots == (1,)
+    np.testing.assert_allclose(fleet_of_one.stages.A[0], alone.stages.A, atol=1e-12)
+
+
 # --- dynamics that are known up to what data leave open
 
 
@@ -564,6 +579,7 @@ def test_an_uncertain_set_is_a_kalman_update_in_both_forms(monkeypatch, robots, 
     for largest in (d, 0):
         monkeypatch.setattr(sets, "DENSE_UP_TO", largest)
         P = Uncertain(layout, stages, V).bind(pins=x_init)
+        assert P.info.rank == layout.rank - len(rows)
         for k in np.ndindex(robots.robots):
             stacked = np.concatenate([rows, G[k]])
             R = np.zeros((len(stacked), len(stacked)))

@@ -118,9 +118,12 @@ def test_it_needs_no_demonstrations_and_refuses_what_is_too_long(monkeypatch):
     recording = GaussianExcitation(60).record(system)
     assert IdentifiedSoft().needs == Identified().needs
     made = IdentifiedSoft().fit(system.layout(5), system, recording)
-    monkeypatch.setattr(doubt, "DOUBTED_UP_TO", 10)
-    with pytest.raises(NotApplicableError, match=r"use projector\.residual=averaged"):
+    size = made.layout.size
+    monkeypatch.setattr(doubt, "DOUBTED_UP_TO", size - 1)
+    with pytest.raises(NotApplicableError, match=rf"d = {size} > {size - 1} .* use projector\.residual=averaged"):
         made.bind()
+    monkeypatch.setattr(doubt, "DOUBTED_UP_TO", size)
+    made.bind()
 
 
 @pytest.mark.parametrize("noise", [False, True], ids=["mean", "draw"])

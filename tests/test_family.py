@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from dadiff.behaviours import IdentifiedFamily, Transitions, compared, least_squares
+from dadiff.behaviours import IdentifiedFamily, Transitions, compared, family, least_squares
 from dadiff.behaviours.family import Belief, Channels, Moments, posterior, prior
 from dadiff.behaviours.sets import Dynamics
 from dadiff.behaviours.stages import Stages, stages_of
@@ -73,6 +73,16 @@ def test_the_family_is_found_in_its_demonstrations():
     np.testing.assert_allclose(deviation[varies], many.std(axis=0)[varies], rtol=0.2)
     assert deviation[~varies].max() < 0.1 * deviation[varies].min()
     np.testing.assert_allclose(np.sqrt(usual().noise), FAMILY.process_noise, rtol=0.05)
+
+
+@pytest.mark.parametrize("constant", [False, True])
+def test_the_search_for_it_begins_at_the_dynamics_that_fit_all_robots_best(constant, monkeypatch):
+    monkeypatch.setattr(family, "ITERATIONS", 0)
+    begun, (x, u) = prior(LAYOUT, shown() + 1.0, constant=constant), LAYOUT.split(shown() + 1.0)
+    phi = np.concatenate([x[:, :-1], u, np.ones((*u.shape[:-1], int(constant)))], axis=-1)
+    found, left, *_ = np.linalg.lstsq(phi.reshape(-1, phi.shape[-1]), x[:, 1:].reshape(-1, x.shape[-1]))
+    np.testing.assert_allclose(begun.mean, found.ravel(), atol=1e-9)
+    np.testing.assert_allclose(begun.noise, left / (phi.shape[0] * phi.shape[1] - phi.shape[-1]), rtol=0.01)
 
 
 @pytest.mark.parametrize(("length", "better"), [(100, 3), (30, 5)])

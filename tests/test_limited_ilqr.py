@@ -12,7 +12,7 @@ from oracles import cart_pole_rate, ipopt, ipopt_of
 from dadiff.behaviours import Known, Limited, Manifold, Pin, pins
 from dadiff.errors import ConfigError
 from dadiff.experts.ilqr import Metric
-from dadiff.experts.limited_ilqr import LimitedTracking, solve
+from dadiff.experts.limited_ilqr import LimitedTracking, linearised, solve
 from dadiff.systems import Bounds, PlanarQuadrotors
 from dadiff.systems.nonlinear import Nonlinear
 from dadiff.systems.quadrotors import PlanarQuadrotor
@@ -65,6 +65,16 @@ def test_inputs_keep_their_bounds_after_one_sweep_already(rng):
     given = problem(robot, rng)
     inputs = given.layout.inputs(solve(given, sweeps=1).tau)
     np.testing.assert_array_equal(inputs, np.clip(inputs, *INPUTS.of_inputs(2)))
+
+
+def test_inputs_that_are_at_a_bound_do_not_react_and_others_do(rng):
+    given = problem(PlanarQuadrotor(bounds=INPUTS), rng)
+    step = linearised(given, solve(given, sweeps=1).tau, None)
+    low, high = INPUTS.of_inputs(2)
+    aim = given.layout.inputs(step.aim)
+    assert (aim == low).any()
+    assert (aim == high).any()
+    np.testing.assert_array_equal(step.K.any(axis=-1)[:, :-1], ((low < aim) & (aim < high))[:, :-1])
 
 
 def test_what_cannot_be_kept_is_said_and_inputs_are_kept(rng):

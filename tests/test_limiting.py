@@ -146,3 +146,14 @@ def test_plans_are_clipped_and_replayed(curved, rng):
     replayed = projected(KnownClipped("fixed", replay=True))
     kept = inputs.clip(-0.3, 0.3)
     np.testing.assert_allclose(replayed, layout.flatten(system.simulate(x_init, kept), kept), atol=1e-12)
+
+
+def test_of_clipped_plans_those_are_missed_whose_states_leave_their_bounds_when_replayed(rng):
+    system = replace(SYSTEMS["paper"], bounds=Bounds(-3.0, 3.0, state_high=5.0))
+    layout = system.layout(8)
+    z = rng.uniform(1, 20, (12, 1)) * rng.standard_normal((12, layout.size))
+    P, replayed = (KnownClipped(replay=replay).fit(layout, system).bind() for replay in (False, True))
+    assert np.abs(P(z)).max() > 2
+    assert P.info.unconverged == 0
+    beyond = (layout.states(replayed(z)).max(axis=(-2, -1)) > 5).sum()
+    assert 0 < replayed.info.unconverged == beyond < 12

@@ -336,6 +336,8 @@ def test_a_start_out_of_bounds_has_no_optimum_and_is_named():
         {"init_range": [1.0, [2.0, 1.0]]},
         {"init_range": [1.0, [2.0]]},
         {"target_range": [1.0, [0.0, float("nan")]]},
+        {"target_range": [1.0, [-float("inf"), 0.0]]},
+        {"target_range": [1.0, [0.0, float("inf")]]},
         {"init_range": 0.0, "target_range": [0.0, [0.0, 0.0]]},
         {"input_cost": float("nan")},
         {"init_range": -1.0},

@@ -12,7 +12,7 @@ from dadiff.evaluation import replay
 from dadiff.running.assembly import Experiment
 from dadiff.running.experiment import execute
 from dadiff.systems import DampedIntegrators, PlanarQuadrotor, PlanarQuadrotors
-from dadiff.tasks import Manoeuvre
+from dadiff.tasks import Manoeuvre, manoeuvre
 
 SMALL = {"horizon": 10, "robots": 4, "interpolation": 3, "extrapolation": 2}
 TINY = ["task=manoeuvre", "task.robots=4", "task.interpolation=3", "task.extrapolation=2", "task.horizon=10"]
@@ -140,6 +140,21 @@ def test_the_expert_begins_where_it_is_told_and_may_be_wrong_about_the_robot(tas
     planned = task.solve(robots, cases.environment, model)[..., None, :]
     rollout = replay(robots, robots.layout(task.horizon), planned, cases.x_init)
     assert (task.score(robots, cases, planned, rollout).per_plan["cost_ratio"] > 1).all()
+
+
+@pytest.mark.parametrize(("plans", "at_once", "robots"), [(1, 1, 1), (3, 7, 2), (3, 2, 1), (2, 500, 5)])
+def test_problems_are_solved_so_many_side_by_side_but_never_less_than_a_robots(
+    plans, at_once, robots, task, rng, monkeypatch
+):
+    sizes, solve = [], manoeuvre.solve
+    family, environment = task.target(PlanarQuadrotors()), task._draw((5, plans), rng)
+    together = task.optimum(family, environment)
+    monkeypatch.setattr(manoeuvre, "_CHUNK", at_once)
+    monkeypatch.setattr(manoeuvre, "solve", lambda one, *a, **k: sizes.append(len(one.x_init)) or solve(one, *a, **k))
+    apart = task.optimum(family, environment)
+    assert max(sizes) == robots
+    assert sum(sizes) == 5
+    np.testing.assert_allclose(apart.tau, together.tau, atol=1e-9)
 
 
 LOOP = ["evaluation=closed_loop", "evaluation.replan_every=[5]", "evaluation.steps=10"]

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import sys
+from collections import defaultdict
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +14,7 @@ from dadiff.errors import MissingExtraError
 from dadiff.experts.obstacles import batched, ipopt, successive
 from dadiff.experts.obstacles.problem import ObstacleProblem, Status
 from dadiff.experts.obstacles.quadratic import obstacle_free
-from dadiff.experts.obstacles.starts import best_of_starts, many_starts, other_side
+from dadiff.experts.obstacles.starts import best_of_starts, many_starts, other_side, subsets
 from dadiff.tasks.obstacles import Obstacles
 
 
@@ -45,6 +47,42 @@ def test_starts_pass_a_disc_on_both_sides() -> None:
     starts = many_starts(off_centre_disc())
     np.testing.assert_allclose(starts[:, 1], starts[:1, 1].repeat(len(starts), axis=0))
     assert {True, False} <= set((starts[:, 15, 1] > 0.4).tolist())
+
+
+@pytest.mark.parametrize("discs", [0, 1, 2])
+def test_where_no_disc_may_be_flipped_there_is_no_choice_of_sides(discs: int) -> None:
+    problem = off_centre_disc()
+    some = replace(problem, centre=problem.centre.repeat(discs, axis=1), radius=problem.radius.repeat(discs, axis=1))
+    path, met = obstacle_free(problem), np.ones((1, discs), dtype=bool)
+    for at_most, largest in ((0, None), (2, 0)):
+        rows, masks = subsets(some, path, met, at_most, largest=largest)
+        assert (rows.shape, masks.shape) == ((0,), (0, discs))
+    rows, masks = subsets(some, path, met, 2)
+    assert (rows.shape, masks.shape) == ((2**discs - 1,), (2**discs - 1, discs))
+    assert len({tuple(mask) for mask in masks}) == 2**discs - 1
+
+
+def test_the_trust_region_shrinks_where_nothing_is_gained_until_it_is_small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The programs are played: better paths twice, then none; where one fails there is no path."""
+    problem, regions = off_centre_disc(), []
+    start = obstacle_free(problem)[0]
+    free = replace(problem, radius=0 * problem.radius)
+    played = [start + 0.2, start + 0.1, start] + 40 * [start + 0.3]
+
+    def play(self: object, one: ObstacleProblem, reference: np.ndarray, region: float) -> np.ndarray:
+        regions.append((region, float(np.abs(reference - start).max())))
+        return played[len(regions) - 1]
+
+    monkeypatch.setattr(successive._Program, "_convexified", play)
+    program = successive._Program(None, None, defaultdict(SimpleNamespace))
+    np.testing.assert_array_equal(program.solve_from(free, start + 0.4), start)
+    sizes, away = zip(*regions, strict=True)
+    np.testing.assert_allclose(away[:5], [0.4, 0.2, 0.1, 0, 0], atol=1e-12)
+    assert sizes[:4] == (1.0,) * 4
+    assert sizes[4:] == tuple(0.5**k for k in range(1, len(sizes) - 3))
+    assert sizes[-1] >= 1e-4 > sizes[-1] / 2
+    monkeypatch.setattr(successive._Program, "_convexified", lambda *_: None)
+    assert program.solve_from(free, start) is None
 
 
 def test_the_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -237,3 +237,12 @@ def test_other_systems_are_refused(system: Linear) -> None:
 
 def test_the_time_step_is_read_from_the_system() -> None:
     assert time_step_of(double_integrator(time_step=0.25)) == pytest.approx(0.25)
+
+
+def test_a_path_that_is_cheaper_by_rounding_alone_replaces_none() -> None:
+    best = batched._Incumbents(np.zeros((3, 5, 2)), np.array([1.0, 2.0, np.inf]))
+    rows, paths = np.array([2, 0, 1, 0]), np.arange(1.0, 5.0)[:, None, None] + np.zeros((4, 5, 2))
+    cheaper = best.challenge(rows, paths, np.array([7.0, 1 - 1e-12, 1.5, 3.0]))
+    assert cheaper.tolist() == [1, 2]
+    np.testing.assert_array_equal(best.cost, [1.0, 1.5, 7.0])
+    np.testing.assert_array_equal(best.positions[:, 0, 0], [0.0, 3.0, 1.0])

@@ -244,6 +244,8 @@ def test_sides_are_told_by_how_the_path_turns_about_the_disc() -> None:
     scores = side_scores(one_disc(), paths(ABOVE, BELOW), np.array([ABOVE]))
     np.testing.assert_array_equal(scores["side_agreement"], [[1, 0]])
     np.testing.assert_array_equal(scores["left_share"], [[0, 1]])
+    away = [[1.6, 0.0], [2, 0], [3, 0]]  # straight away from the centre: it turns about it by no angle
+    np.testing.assert_array_equal(side_scores(one_disc(), paths(away), np.array([away]))["left_share"], [[0]])
 
 
 def test_the_expert_scores_perfectly_and_a_straight_run_collides(cases: Cases) -> None:

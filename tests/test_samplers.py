@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from laws import SYSTEMS, component, presets, tolerance, variants
 
 from dadiff.denoisers.exact import ExactDenoiser
+from dadiff.diffusion import chain
 from dadiff.diffusion.chain import Samples, sample
 from dadiff.diffusion.enforcement import PostHoc
 from dadiff.diffusion.samplers import DDIM, DDPM, LEAST_SIGNAL, DPMSolver, Step, visited
@@ -373,6 +374,15 @@ def test_a_chain_stops_where_a_value_leaves_the_bound():
     stopped = run(500.0)
     assert stopped.diverged_at > 10
     assert stopped.network_calls == 20 - stopped.diverged_at + 1
+
+
+@pytest.mark.parametrize("progress", [False, True])
+def test_a_chain_shows_its_progress_only_if_it_is_asked_to(progress, monkeypatch):
+    shown = []
+    monkeypatch.setattr(chain, "tqdm", lambda steps, **_: shown.append(len(steps)) or steps)
+    still, nothing = (lambda tau, i, environment: tau), torch.zeros(1, 1, dtype=torch.float64)
+    sample(DDIM(4), cosine(9), still, nothing, (1, 2), torch_generator(0, "x"), progress=progress)
+    assert shown == [4] * progress
 
 
 def test_a_projection_at_the_end_that_leaves_the_bound_is_seen():
