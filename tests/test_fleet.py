@@ -143,6 +143,11 @@ class TestTask:
         np.testing.assert_array_equal(cases.x_init[0], cases.x_init[4])
         assert np.abs(cases.reference[0] - cases.reference[4]).max() > 0.1
 
+    @pytest.mark.parametrize("robot", [0, 4])
+    def test_the_first_and_the_last_robot_may_be_alone(self, robot):
+        everyone, one = (fleet_for(self.family, alone=alone).target(self.family) for alone in (None, robot))
+        np.testing.assert_array_equal(one.A, everyone.A[[robot]])
+
     def test_alone_is_the_same_robot_with_the_same_cases(self):
         everyone, one = fleet_for(self.family), fleet_for(self.family, alone=3)
         cases, only = (Generated(5, 4).test(task, task.target(self.family)) for task in (everyone, one))

@@ -77,6 +77,20 @@ def test_inputs_that_are_at_a_bound_do_not_react_and_others_do(rng):
     np.testing.assert_array_equal(step.K.any(axis=-1)[:, :-1], ((low < aim) & (aim < high))[:, :-1])
 
 
+def test_where_no_bound_is_near_inputs_react_as_in_the_lqr_problem(rng):
+    """Riccati's recursion written out, along the linearised dynamics and with the weights of the distance."""
+    robot = PlanarQuadrotor(bounds=Bounds(-1e3, 1e3))
+    given = problem(robot, rng, plans=1)
+    tau = solve(given, sweeps=1).tau
+    (x, u), (Q, R) = given.layout.split(tau[0]), given.layout.split(given.scale**-2.0)
+    A, B, _ = robot.linearise(x[:-1], u)
+    P, K = np.diag(Q[-1]), linearised(given, tau, None).K[0]
+    for t in reversed(range(HORIZON)):
+        feedback = -np.linalg.solve(np.diag(R[t]) + B[t].T @ P @ B[t], B[t].T @ P @ A[t])
+        P = np.diag(Q[t]) + A[t].T @ P @ (A[t] + B[t] @ feedback)
+        np.testing.assert_allclose(K[t], feedback, atol=1e-9)
+
+
 def test_what_cannot_be_kept_is_said_and_inputs_are_kept(rng):
     fast = Bounds(-0.1, 0.1, -1.0, 1.0)
     robot = PlanarQuadrotor(bounds=fast)

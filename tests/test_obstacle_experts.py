@@ -121,3 +121,25 @@ def test_without_a_disc_to_pass_the_start_is_the_obstacle_free_optimum() -> None
     problem = off_centre_disc()
     heavy, none = replace(problem, weight=3 * problem.weight), np.zeros((1, 1), dtype=bool)
     np.testing.assert_allclose(other_side(heavy, obstacle_free(heavy), none, none), obstacle_free(heavy))
+
+
+@pytest.mark.parametrize("weight", [0.0, 1.0], ids=["between waypoints", "at a waypoint"])
+def test_discs_are_passed_by_a_waypoint_beyond_the_rim_on_the_side_that_is_asked_for(weight: float) -> None:
+    """Where the path is nearest to each centre: as far out as it is if it may stay, mirrored just beyond if not."""
+    problem = off_centre_disc()
+    problem = replace(
+        problem, centre=np.array([[[1.5, 0.4], [2.2, -0.9]]]), radius=np.array([[0.55, 0.3]]), weight=problem.weight
+    )
+    problem.weight[0, 15] = weight
+    path, flip = obstacle_free(problem), np.array([[True, False]])
+    found = other_side(problem, path, ~flip, flip)
+    weights, goals = problem.weight[0].copy(), problem.goal[0].copy()
+    for centre, radius, flipped in zip(problem.centre[0], problem.radius[0], flip[0], strict=True):
+        away = np.linalg.norm(path[0, 2:] - centre, axis=-1)
+        t = 2 + away.argmin()
+        out = (path[0, t] - centre) / away.min()
+        there = centre - 1.05 * radius * out if flipped else centre + max(1.05 * radius, away.min()) * out
+        goals[t] = (weights[t] * goals[t] + 10 * there) / (weights[t] + 10)
+        weights[t] += 10
+    expected = obstacle_free(replace(problem, weight=weights[None], goal=goals[None]))
+    np.testing.assert_allclose(found, expected, atol=1e-9)

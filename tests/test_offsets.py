@@ -174,3 +174,11 @@ def test_a_hull_that_knows_of_no_offset_lies_about_0():
     assert Hull.of(recording, layout, "none", plant).origin is None
     assert Hull.of(recording, layout, "known", None).origin is None
     assert np.abs(Hull.of(recording, layout, "known", plant).origin).max() > 0
+
+
+def test_the_gaps_of_a_fleets_hulls_are_those_of_the_robot_whose_gap_is_smallest():
+    hull = Hull.of(exciting(40, 0.1).record(PLANTS["fleet"]), PLANTS["fleet"].layout(HORIZON), "none", None)
+    count = hull.sizes.shape[-1]
+    for rank in range(1, count):
+        assert hull.gap(rank) == pytest.approx(min(s[rank - 1] / s[rank] for s in hull.sizes))
+    assert hull.gap(count) == np.inf
