@@ -349,6 +349,15 @@ def test_values_out_of_range_are_refused_in_one_line(options):
         LQR(**options)
 
 
+@pytest.mark.parametrize(
+    ("weight", "found"),
+    [([[1.0, 2.0], [2.0, 1.0]], r"its eigenvalues are \[-1.0, 3.0\]"), ((1.0, -2.0), r"\[1.0, -2.0\]"), (-1.0, "-1.0")],
+)
+def test_of_a_weight_that_is_not_definite_it_is_said_what_is_negative(weight, found):
+    with pytest.raises(ConfigError, match=rf"found {found}$"):
+        LQR(state_cost=weight)
+
+
 @pytest.mark.parametrize("state_cost", [(), (1.0, 1.0, 1.0)])
 def test_one_weight_a_state(state_cost):
     with pytest.raises(ConfigError, match=rf"state_cost has {len(state_cost)} entries, the system 4 states"):

@@ -60,6 +60,7 @@ def test_where_no_disc_may_be_flipped_there_is_no_choice_of_sides(discs: int) ->
     rows, masks = subsets(some, path, met, 2)
     assert (rows.shape, masks.shape) == ((2**discs - 1,), (2**discs - 1, discs))
     assert len({tuple(mask) for mask in masks}) == 2**discs - 1
+    assert [mask.sum() for mask in subsets(some, path, met, 2, largest=1)[1]] == [1] * discs
 
 
 def test_the_trust_region_shrinks_where_nothing_is_gained_until_it_is_small(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from laws import SYSTEMS, component, presets, tolerance, variants
 
 from dadiff.denoisers.exact import ExactDenoiser
-from dadiff.diffusion import chain
+from dadiff.diffusion import chain, samplers
 from dadiff.diffusion.chain import Samples, sample
 from dadiff.diffusion.enforcement import PostHoc
 from dadiff.diffusion.samplers import DDIM, DDPM, LEAST_SIGNAL, DPMSolver, Step, visited
@@ -242,6 +242,18 @@ def test_skipping_moves_the_sample_by_less_than_its_bound(schedule):
 def test_most_of_the_papers_chain_needs_no_call():
     calls = sum(step.call for step in component("sampler", "ddpm").steps(paper_linear()))
     assert 100 < calls <= 200
+
+
+@pytest.mark.parametrize(("bound", "skipped"), [(0.0, 1), (0.2, 1), (0.25, 2), (0.5, 2), (0.625, 3)])
+def test_calls_are_skipped_as_long_as_they_weigh_no_more_than_the_bound_together(bound, skipped):
+    """Their weights are 0, 1/4, 1/2 * 1/4 + 1/2 = 5/8 and 1."""
+    steps = [
+        Step(4, 3, 0.0, 1.0, 0.0),
+        Step(3, 2, 0.25, 1.0, 0.0),
+        Step(2, 1, 0.5, 0.5, 0.0),
+        Step(1, 0, 1.0, 0.0, 0.0),
+    ]
+    assert [step.call for step in samplers._skip(steps, bound)] == [False] * skipped + [True] * (4 - skipped)
 
 
 @every_schedule

@@ -5,7 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dadiff.trajectory.subspace import column_basis, largest_angle, null_space, numerical_rank, projector_distance
+from dadiff.trajectory.subspace import (
+    column_basis,
+    column_scaled,
+    largest_angle,
+    null_space,
+    numerical_rank,
+    projector_distance,
+)
 
 
 def test_a_basis_is_orthonormal_and_spans_the_image(rng):
@@ -56,3 +63,10 @@ def test_the_distance_is_that_of_the_projectors(rng):
 def test_orthogonal_images_are_a_right_angle_apart_whatever_rounding_does(rng):
     bases = column_basis(rng.standard_normal((200, 6, 6)))
     np.testing.assert_allclose(largest_angle(bases[..., :3], bases[..., 3:]), np.pi / 2)
+
+
+def test_columns_are_scaled_to_length_1_whatever_their_unit_and_zeros_stay(rng):
+    M = rng.standard_normal((3, 8, 5)) * [1e-9, 0.1, 0.0, 10.0, 1e9]
+    scaled = column_scaled(M)
+    np.testing.assert_allclose(np.linalg.norm(scaled, axis=-2), np.tile([1, 1, 0, 1, 1], (3, 1)))
+    np.testing.assert_allclose(scaled * np.linalg.norm(M, axis=-2, keepdims=True), M)
