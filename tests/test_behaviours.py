@@ -564,6 +564,19 @@ def test_demonstrations_say_as_much_of_a_fleet_of_one_robot():
     np.testing.assert_allclose(fleet_of_one.stages.A[0], alone.stages.A, atol=1e-12)
 
 
+def test_where_start_and_inputs_are_pinned_nothing_is_free_and_one_pin_more_cannot_hold(system, rng):
+    layout, x = system.layout(HORIZON), rng.standard_normal((PLANS, system.state_dim))
+    inputs = rng.standard_normal((PLANS, HORIZON, system.input_dim))
+    given = [Pin.initial_state(layout, x), Pin(layout.all_inputs, inputs.reshape(PLANS, -1))]
+    target = Dynamics(layout, Stages.constant(system.A, system.B, None, HORIZON))
+    P, tau = target.bind(pins=given), layout.flatten(system.simulate(x, inputs), inputs)
+    assert P.info.rank == 0
+    np.testing.assert_allclose(P(generic(system, PLANS)), tau, atol=close(system, np.abs(tau).max()))
+    last = np.arange(layout.size)[layout.all_states][-1:]
+    with pytest.raises(ConfigError, match="cannot hold together; pin fewer entries"):
+        target.bind(pins=[*given, Pin(last, tau[:, last])])(tau)
+
+
 # --- dynamics that are known up to what data leave open
 
 
