@@ -35,11 +35,12 @@ from dadiff.behaviours import (
     Uncertain,
     compared,
     least_squares,
+    model_of,
     pins,
     sets,
 )
 from dadiff.errors import ConfigError, ExcitationError, ShapeError
-from dadiff.systems import Bounds, GaussianExcitation, Linear, Recording, double_integrator
+from dadiff.systems import Bounds, GaussianExcitation, Linear, Recording, TimeVarying, double_integrator
 from dadiff.trajectory import Channel, Layout
 from dadiff.trajectory.coordinates import Coordinates, physical
 from dadiff.trajectory.covariance import Covariance
@@ -562,6 +563,23 @@ def test_demonstrations_say_as_much_of_a_fleet_of_one_robot():
     )
     assert fleet_of_one.robots == (1,)
     np.testing.assert_allclose(fleet_of_one.stages.A[0], alone.stages.A, atol=1e-12)
+
+
+@pytest.mark.parametrize("horizon", [1, 3])
+def test_dynamics_that_stay_the_same_are_a_system_and_others_one_that_varies(horizon, system, rng):
+    layout, c = system.layout(horizon), rng.standard_normal(system.state_dim)
+    stages = Stages.constant(system.A, system.B, c, horizon)
+    x, inputs = (rng.standard_normal((2, *shape)) for shape in ((system.state_dim,), (horizon, system.input_dim)))
+    model = model_of(Dynamics(layout, stages))
+    assert isinstance(model, Linear)
+    np.testing.assert_allclose(model.simulate(x, inputs), stages.simulate(x, inputs), atol=1e-12)
+    for name in ("A", "B", "c") if horizon > 1 else ():
+        moving = getattr(stages, name).copy()
+        moving[-1] += 1
+        other = replace(stages, **{name: moving})
+        model = model_of(Dynamics(layout, other))
+        assert isinstance(model, TimeVarying)
+        np.testing.assert_allclose(model.simulate(x, inputs), other.simulate(x, inputs), atol=1e-12)
 
 
 def test_where_start_and_inputs_are_pinned_nothing_is_free_and_one_pin_more_cannot_hold(system, rng):

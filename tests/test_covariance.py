@@ -105,3 +105,12 @@ def test_roots_and_inverses_of_semidefinite_matrices_do_not_depend_on_units(rng)
         scaled = scale[:, None] * M * scale
         inverse = semidefinite_inverse(scaled)
         np.testing.assert_allclose(scaled @ inverse @ scaled / np.outer(scale, scale), M, atol=1e-8)
+
+
+@pytest.mark.parametrize("size", [1e-4, 1.0, 1e4])
+def test_what_is_made_invertible_does_not_depend_on_units(size):
+    """Certain entries are given a millionth of the mean variance."""
+    C = Covariance(np.array([0.0, 1, 2, 0, 3, 4]), np.zeros((SIZE, 0)))
+    found = C.scaled(size).invertible
+    np.testing.assert_allclose(found.matrix, size * C.invertible.matrix, rtol=1e-9, atol=1e-15 * size)
+    assert np.diag(C.invertible.matrix)[[0, 3]] == pytest.approx(1e-6 * 10 / 6, rel=1e-3)

@@ -21,6 +21,7 @@ from dadiff.behaviours import (
     pins,
     prediction_error,
 )
+from dadiff.behaviours.least_squares import regression
 from dadiff.errors import ConfigError, ExcitationError, ShapeError
 from dadiff.systems import GaussianExcitation, PlanarQuadrotors, Recording, Simulated, double_integrator
 from dadiff.systems.features import Features, Regressed
@@ -181,6 +182,19 @@ def test_koopman_finds_what_closes_on_its_observables(rng):
     assert prediction_error(linear, truth, tau)["prediction_error"] > 0.1
     project = found.bind(None, [Pin.initial_state(layout, states[:, 0])])
     np.testing.assert_allclose(project(tau), tau, atol=1e-2)
+
+
+@pytest.mark.parametrize("ridge", [0.0, 0.5, 20.0])
+def test_a_ridge_weighs_what_is_found_against_the_deviations_of_the_features(ridge, rng):
+    """The normal equations, solved; the residual's variance takes one degree of freedom off for each feature."""
+    Phi, target = rng.standard_normal((2, 30, 4)) * [1, 2, 3, 0.1], rng.standard_normal((2, 30, 3))
+    theta, root, noise = regression(Phi, target, ridge)
+    for k in range(2):
+        inverse = np.linalg.inv(Phi[k].T @ Phi[k] + ridge * np.diag(Phi[k].var(axis=0)))
+        np.testing.assert_allclose(theta[k].T, inverse @ Phi[k].T @ target[k], atol=1e-10)
+        np.testing.assert_allclose(root[k] @ root[k].T, inverse, atol=1e-12 * inverse.max())
+        left = target[k] - Phi[k] @ theta[k].T
+        np.testing.assert_allclose(noise[k], np.square(left).sum(axis=0) / 26)
 
 
 def test_koopman_lifts_at_x0_and_sees_states_alone():

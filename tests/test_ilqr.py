@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from oracles import ipopt
 
 from dadiff.behaviours.stages import stages_of
 from dadiff.errors import ConfigError
-from dadiff.experts.ilqr import Metric, Tracking, gauss_newton, solve
+from dadiff.experts import ilqr
+from dadiff.experts.ilqr import Metric, Tracking, backtrack, gauss_newton, solve
 from dadiff.systems import Linear
 from dadiff.systems.nonlinear import Nonlinear
 from dadiff.systems.quadrotors import PlanarQuadrotor
@@ -163,3 +166,32 @@ def test_a_start_need_not_be_feasible(rng):
     found = solve(problem, rough)
     assert problem.feasible(found.tau).all()
     np.testing.assert_allclose(found.cost, solve(problem).cost, rtol=1e-8)
+
+
+def test_steps_are_halved_plan_by_plan_until_none_is_worse():
+    """Merits are played: one plan may move by 1, one by a quarter at most, one not at all, one has ended."""
+    tried, tau, most = [], np.zeros((4, 1)), np.array([1.0, 0.3, 0.0, 1.0])
+
+    def trial(a):
+        tried.append(a.copy())
+        return a[:, None]
+
+    def merit(plans):
+        return np.where(plans[:, 0] <= most, 1 - plans[:, 0], 2.0)
+
+    ended = np.array([False, False, False, True])
+    best, least, moved = backtrack(trial, merit, tau, np.ones(4), np.zeros(4), 5, ended)
+    np.testing.assert_array_equal(best[:, 0], [1.0, 0.25, 0.0, 0.0])
+    np.testing.assert_array_equal(least, [0.0, 0.75, 1.0, 1.0])
+    assert moved.tolist() == [True, True, False, False]
+    np.testing.assert_array_equal([a[2] for a in tried], [1, 1 / 2, 1 / 4, 1 / 8, 1 / 16])
+
+
+def test_damping_falls_tenfold_with_each_sweep_that_helps_and_ends_at_0(rng):
+    robots = quadrotors(rng)
+    layout = robots.layout(HORIZON)
+    problem = Tracking(robots, metric(layout, rng, 0), rng.standard_normal((3, 2, layout.size)), starts(rng, 3, 2))
+    plans = ilqr._Plans.of(problem, solve(problem).tau + 1e-3)
+    for damping, expected in ((1.0, 0.1), (10 * ilqr._DAMPING, ilqr._DAMPING), (ilqr._DAMPING, 0.0), (0.0, 0.0)):
+        after = ilqr._sweep(problem, replace(plans, damping=np.full_like(plans.damping, damping)), 1e-12)
+        np.testing.assert_allclose(after.damping, np.full_like(plans.damping, expected), rtol=1e-12)

@@ -142,6 +142,12 @@ def test_the_expert_begins_where_it_is_told_and_may_be_wrong_about_the_robot(tas
     assert (task.score(robots, cases, planned, rollout).per_plan["cost_ratio"] > 1).all()
 
 
+def test_states_may_cost_nothing_and_starts_and_targets_may_be_given():
+    task = Manoeuvre(state_cost=(1, 1, 0, 0, 0, 0), init_range=(1, 1, 0, 0, 0, 0), target_range=(0, 0), **SMALL)
+    drawn = task._draw((50,), np.random.default_rng(0))
+    np.testing.assert_array_equal(drawn.any(axis=0), [True, True] + 6 * [False])
+
+
 @pytest.mark.parametrize(("plans", "at_once", "robots"), [(1, 1, 1), (3, 7, 2), (3, 2, 1), (2, 500, 5)])
 def test_problems_are_solved_so_many_side_by_side_but_never_less_than_a_robots(
     plans, at_once, robots, task, rng, monkeypatch

@@ -388,6 +388,25 @@ def test_a_chain_stops_where_a_value_leaves_the_bound():
     assert stopped.network_calls == 20 - stopped.diverged_at + 1
 
 
+@pytest.mark.parametrize("skip_below", [0.0, 0.1])
+def test_the_sample_of_the_first_call_is_shown_where_steps_came_before_it(skip_below):
+    seen, sampler, schedule = [], DDPM(skip_below=skip_below), cosine(20)
+    still, nothing = (lambda tau, i, environment: tau), torch.zeros(1, 1, dtype=torch.float64)
+    first = next(step.i for step in sampler.steps(schedule) if step.call)
+    sample(
+        sampler,
+        schedule,
+        still,
+        nothing,
+        (1, 2),
+        torch_generator(0, "x"),
+        observe=lambda j, stage, _: seen.append((j, stage)),
+    )
+    assert (first < 20) == bool(skip_below)
+    expected = [(j, stage) for j in range(first - 1, -1, -1) for stage in ("predict", "project")]
+    assert seen == [(first, "project")] * (first < 20) + expected + [(0, "end")]
+
+
 @pytest.mark.parametrize("progress", [False, True])
 def test_a_chain_shows_its_progress_only_if_it_is_asked_to(progress, monkeypatch):
     shown = []
