@@ -9,10 +9,12 @@ import pytest
 from oracles import ipopt
 
 from dadiff.behaviours.stages import stages_of
-from dadiff.errors import ConfigError
+from dadiff.errors import ConfigError, ShapeError
 from dadiff.experts import ilqr
 from dadiff.experts.ilqr import Metric, Tracking, backtrack, gauss_newton, solve
-from dadiff.systems import Linear
+from dadiff.experts.limited_ilqr import LimitedTracking
+from dadiff.experts.nearest import Limits
+from dadiff.systems import Bounds, Linear
 from dadiff.systems.nonlinear import Nonlinear
 from dadiff.systems.quadrotors import PlanarQuadrotor
 
@@ -195,3 +197,16 @@ def test_damping_falls_tenfold_with_each_sweep_that_helps_and_ends_at_0(rng):
     for damping, expected in ((1.0, 0.1), (10 * ilqr._DAMPING, ilqr._DAMPING), (ilqr._DAMPING, 0.0), (0.0, 0.0)):
         after = ilqr._sweep(problem, replace(plans, damping=np.full_like(plans.damping, damping)), 1e-12)
         np.testing.assert_allclose(after.damping, np.full_like(plans.damping, expected), rtol=1e-12)
+
+
+@pytest.mark.parametrize("bounded", [False, True])
+@pytest.mark.parametrize("shape", [(3, 2, -1), (3, 0), (2, 2, 0), (3, 2, 2, 0)])
+def test_references_are_given_robot_by_robot_plan_by_plan_and_whole(shape, bounded, rng):
+    """The last number is added to d."""
+    robots = replace(quadrotors(rng), bounds=Bounds(-1.0, 1.0))
+    layout = robots.layout(HORIZON)
+    reference = np.zeros((*shape[:-1], layout.size + shape[-1]))
+    limited = (layout, reference, np.ones(layout.size), Limits.nothing(layout, 6))
+    kind, given = (LimitedTracking, limited) if bounded else (Tracking, (metric(layout, rng, 0), reference))
+    with pytest.raises(ShapeError, match=rf"expected \(3, 'plans', {layout.size}\)"):
+        kind(robots, *given)

@@ -10,7 +10,17 @@ import pytest
 import torch
 from laws import SYSTEMS, Linear, composed, exciting, fleet, random_system, trajectories, varying_system
 
-from dadiff.behaviours import Dynamics, Identified, IdentifiedSoft, Known, Limited, Pin, pins, prediction_error
+from dadiff.behaviours import (
+    Dynamics,
+    Identified,
+    IdentifiedSoft,
+    Known,
+    KnownClear,
+    Limited,
+    Pin,
+    pins,
+    prediction_error,
+)
 from dadiff.behaviours.stages import stages_of
 from dadiff.errors import ConfigError, NotApplicableError
 from dadiff.experts.nearest import Limits, within
@@ -268,3 +278,14 @@ def test_a_planner_keeps_clear_of_the_discs_of_what_it_is_asked(tmp_path) -> Non
         execute(Experiment.of(composed(*small, *rest, f"projector={name}"))) for name in ("known_fixed", "known_clear")
     )
     assert clear.metrics["collision_rollout"] < 0.7 * known.metrics["collision_rollout"]
+
+
+@pytest.mark.parametrize(
+    ("options", "kept"), [({"rounds": 1, "margin": 0.0}, True), ({"rounds": 0}, False), ({"margin": -1e-3}, False)]
+)
+def test_discs_need_a_round_and_a_margin_that_is_not_negative(options, kept) -> None:
+    if kept:
+        assert KnownClear(**options).rounds == 1
+        return
+    with pytest.raises(ConfigError, match="need >= 0 and >= 1"):
+        KnownClear(**options)

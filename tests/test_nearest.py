@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from laws import tolerance
@@ -206,3 +208,16 @@ def test_limits_say_what_is_exceeded(estimates: np.ndarray) -> None:
     free = Limits.nothing(LAYOUT, COUNT)
     boxes = Limits(given.low, given.high, free.normal, free.offset)
     np.testing.assert_allclose(boxes.exceeded(LAYOUT, tau), 0.5)
+
+
+def test_what_a_plan_lacks_to_keep_its_limits_is_added_up():
+    """x(t) = t along the first axis; a bound of 1 on it, and a wall that asks for 2 or more of the second at t = 2."""
+    layout = TrajectoryLayout(2, 1, 2)
+    tau = layout.flatten(np.array([[[0.0, 0], [1, 0], [2, 0.5]]]), np.array([[[3.0], [-4.0]]]))
+    none = Limits.nothing(layout, 1)
+    walls = replace(none, normal=np.tile([0.0, 1.0], (1, 3, 1, 1)), offset=np.array([[[-np.inf], [-np.inf], [2.0]]]))
+    low, high = (layout.flatten(np.full((1, 3, 2), x), np.full((1, 2, 1), u)) for x, u in ((-np.inf, -1.0), (1.0, 1.0)))
+    assert none.exceeded(layout, tau) == 0
+    assert walls.exceeded(layout, tau) == 1.5
+    assert replace(none, low=low, high=high).exceeded(layout, tau) == 1 + 2 + 3
+    assert replace(walls, low=low, high=high).exceeded(layout, tau) == 1.5 + 1 + 2 + 3

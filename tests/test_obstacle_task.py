@@ -174,6 +174,7 @@ def test_more_obstacles_than_a_model_has_slots_for_are_refused(cases: Cases) -> 
         ({"box": 0.3}, "box is 0.3"),
         ({"waypoint_times": [33, 5]}, "waypoint_times are"),
         ({"waypoint_times": [5, 40]}, "waypoint_times are"),
+        ({"waypoint_times": [0, 5]}, "waypoint_times are"),
         ({"waypoint_times": [5, 9, 33]}, "max_waypoints is 2"),
         ({"radius_range": [0.8, 0.4]}, "radius_range is"),
     ],
@@ -341,6 +342,13 @@ def test_the_number_of_obstacles_that_the_message_names_is_the_largest_that_does
     assert f"or at most {sum(value >= 0 for value in least) - 1} of its {present} obstacles" in str(told.value)
 
 
+def test_a_number_of_obstacles_that_just_does_is_named() -> None:
+    problem = literal_problem(input_cost=1.0)
+    least = np.linalg.eigvalsh(literal.curvature(problem, 0, 1))[0]
+    with pytest.raises(InfeasibleError, match="or at most 1 of its"):
+        literal.check_bounded(replace(problem, input_cost=1.0 - least + 0.5), 0)
+
+
 def test_a_bounded_printed_cost_is_solved_to_its_minimum() -> None:
     problem = literal_problem(waypoint_weight=1000.0, input_cost=1.0)
     found = literal.solve(problem)
@@ -358,3 +366,7 @@ def test_plans_are_not_priced_against_the_printed_cost() -> None:
     cases = task.cases(SYSTEM, 2, np.random.default_rng(0))
     plans = cases.reference[:, None]
     assert "cost_ratio" not in task.score(SYSTEM, cases, plans, plans).per_plan
+
+
+def test_waypoints_may_be_due_one_step_after_the_start_and_one_before_the_end() -> None:
+    assert Obstacles(horizon=12, waypoint_times=[1, 11]).waypoint_times == [1, 11]

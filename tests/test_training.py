@@ -16,7 +16,7 @@ from safetensors.torch import load_file
 
 from dadiff.denoisers import MLP, EncoderDecoder, learning
 from dadiff.denoisers.checkpoints import load
-from dadiff.denoisers.learning import Data, Objective, train
+from dadiff.denoisers.learning import Data, Objective, State, train
 from dadiff.denoisers.recipes import Recipe
 from dadiff.denoisers.training import Training
 from dadiff.diffusion.schedule import paper_linear
@@ -344,3 +344,22 @@ def test_what_a_training_gives_is_the_running_mean_of_its_weights(tmp_path, monk
     *_, last, mean = seen
     assert all(torch.equal(a, b) for a, b in zip(given, mean, strict=True))
     assert not all(torch.allclose(a, b, atol=1e-4) for a, b in zip(given, last, strict=True))
+
+
+@pytest.mark.parametrize(("step", "expected"), [(1, 0.0), (40, 19.5), (100, 49.5), (250, 199.5)])
+def test_the_recent_loss_is_the_mean_of_the_last_hundred(step, expected):
+    losses = torch.full((300,), torch.nan).index_copy(0, torch.arange(step), torch.arange(step, dtype=torch.float32))
+    assert State.recent_loss(SimpleNamespace(losses=losses, step=step)) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("steps", [7, 500, 1203])
+def test_a_row_of_the_curve_is_the_mean_since_the_last(steps, tmp_path):
+    losses, seconds = torch.arange(steps, dtype=torch.float64) ** 2, torch.arange(steps)
+    State.write_curve(SimpleNamespace(training=Training(steps=steps), losses=losses, seconds=seconds), tmp_path / "c")
+    rows = list(csv.DictReader((tmp_path / "c").open()))
+    ends = np.array([int(row["step"]) for row in rows])
+    assert len(rows) <= 500
+    assert ends[-1] == steps
+    sums = np.array([float(row["loss"]) for row in rows]) * np.diff(ends, prepend=0)
+    np.testing.assert_allclose(sums.cumsum(), np.cumsum(losses.numpy())[ends - 1])
+    assert [int(row["seconds"].split(".")[0]) for row in rows] == (ends - 1).tolist()
