@@ -114,3 +114,11 @@ def test_what_is_made_invertible_does_not_depend_on_units(size):
     found = C.scaled(size).invertible
     np.testing.assert_allclose(found.matrix, size * C.invertible.matrix, rtol=1e-9, atol=1e-15 * size)
     assert np.diag(C.invertible.matrix)[[0, 3]] == pytest.approx(1e-6 * 10 / 6, rel=1e-3)
+
+
+@pytest.mark.parametrize("count", [0, 2, SIZE])
+def test_leading_directions_of_a_fleet_are_those_of_its_robots(count):
+    fleet = some(3, (2,))
+    for k in range(2):
+        alone = Covariance(fleet.diagonal[k], fleet.factor[k]).leading(count)
+        np.testing.assert_allclose(fleet.leading(count).matrix[k], alone.matrix, atol=1e-12)

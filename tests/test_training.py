@@ -363,3 +363,7 @@ def test_a_row_of_the_curve_is_the_mean_since_the_last(steps, tmp_path):
     sums = np.array([float(row["loss"]) for row in rows]) * np.diff(ends, prepend=0)
     np.testing.assert_allclose(sums.cumsum(), np.cumsum(losses.numpy())[ends - 1])
     assert [int(row["seconds"].split(".")[0]) for row in rows] == (ends - 1).tolist()
+
+
+def test_a_training_may_be_of_one_step_of_one_trajectory():
+    assert Training(steps=1, batch_size=1, checkpoint_every=1).steps == 1
