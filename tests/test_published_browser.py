@@ -59,9 +59,14 @@ def test_texts_of_published_drawings_stand_out_and_lie_inside(browser, drawing):
         """const box = document.documentElement.getBoundingClientRect();
            return [...document.querySelectorAll('text')].filter(t => t.textContent.trim()).map(t => {
              const r = t.getBoundingClientRect();
-             return [t.textContent, getComputedStyle(t).fill, r.left < box.left - 2 || r.right > box.right + 2
+             const under = [...document.querySelectorAll('path')].filter(p => {
+               const b = p.getBoundingClientRect();
+               return b.left <= r.left && b.right >= r.right && b.top <= r.top && b.bottom >= r.bottom
+                 && b.width < 200 && getComputedStyle(p).fill != 'none'}).pop();
+             return [t.textContent, getComputedStyle(t).fill, under ? getComputedStyle(under).fill : null,
+                     r.left < box.left - 2 || r.right > box.right + 2
                      || r.bottom > box.bottom + 2 || r.top < box.top - 2]})"""
     )
     assert texts
-    assert [text for text, _, outside in texts if outside] == []
-    assert [text for text, ink, _ in texts if contrast(panel, ink) < 3] == []
+    assert [text for text, *_, outside in texts if outside] == []
+    assert [text for text, ink, cell, _ in texts if contrast(cell or panel, ink) < 3] == []
